@@ -1,0 +1,193 @@
+"""Play trained agents zero-shot at other numbers of distractors and measure fractional success (section 4.3, figure 3 right).
+
+    python evaluate.py RUN [RUN ...] --distractors 0-9 --episodes 200      table, and zeroshot.csv in each run folder
+    python evaluate.py RUN --mean-actions                                  without sampling noise: zeroshot-mean.csv
+    python evaluate.py RUN [RUN ...] --episodes 0 --plot curves.png        training and zero-shot curves from the CSV files
+    python evaluate.py RUN --distractors 9 --episodes 0 --gif push.gif     a film of one episode
+
+Episode j starts from the same seed at every N and for every agent: the goal and the target cube stand in the same places,
+only the distractors differ. The seeds belong to no training run.
+"""
+import argparse
+import csv
+import multiprocessing
+import os
+
+import numpy as np
+import torch
+
+from train import fail, load, make_env
+
+COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict", "solved", "cut_short")
+CHUNK = 25                                # episodes played side by side; fixed, so that results do not depend on the cores
+
+
+def episode_seed(episode):
+    """Seed of evaluation episode `episode`; the leading number keeps it apart from training's (seed, update, env)."""
+    return int(np.random.SeedSequence((20220131, episode)).generate_state(1)[0])
+
+
+@torch.inference_mode()
+def play(path, distractors, first, count, mean_actions):
+    """Play episodes first .. first+count-1 of the agent in `path`. Returns a list of (rho, strict rho, was cut short)."""
+    torch.set_num_threads(1)
+    checkpoint, agent = load(path)
+    envs = [make_env(checkpoint["task"], distractors, checkpoint["settings"]) for _ in range(count)]
+    noise = [np.random.default_rng(episode_seed(first + e)) for e in range(count)]
+    observations, results = [env.reset(seed=episode_seed(first + e))[0] for e, env in enumerate(envs)], [None] * count
+    while None in results:
+        mean, log_std, _ = agent({key: torch.from_numpy(np.stack([obs[key] for obs in observations])) for key in observations[0]})
+        mean, std = mean.numpy(), log_std.exp().numpy()
+        for e, env in enumerate(envs):
+            if results[e] is None:
+                action = mean[e] if mean_actions else mean[e] + std * noise[e].standard_normal(9)
+                observations[e], _, _, truncated, info = env.step(action)
+                if truncated:
+                    results[e] = info["fractional_success"], info["fractional_success_strict"], info["truncated_by"] != "time"
+    for env in envs:
+        env.close()
+    return results
+
+
+def summary(distractors, results):
+    """One row of zeroshot.csv; ci95 is the half width of the normal 95 % interval of the mean over episodes."""
+    values = np.array(results, float)                                          # (episodes, 3)
+    half = 1.96 * values.std(0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.full(3, np.nan)
+    mean = values.mean(0)
+    return dict(zip(COLUMNS, (distractors, len(values), mean[0], mean[1], half[0], half[1], (values[:, 0] >= 0.8).mean(), int(values[:, 2].sum()))))
+
+
+def evaluate(run, distractors, episodes, mean_actions=False):
+    """Play `episodes` episodes at every N in `distractors` on all cores; prints, writes and returns the rows."""
+    checkpoint, _ = load(run)
+    if checkpoint["encoder"] == "mlp" and any(n != checkpoint["distractors"] for n in distractors):
+        print(f"{run}: an mlp has a fixed input, so it can be played at its own N = {checkpoint['distractors']} only")
+        distractors = [n for n in distractors if n == checkpoint["distractors"]]
+    chunks = [(n, first, min(CHUNK, episodes - first)) for n in distractors for first in range(0, episodes, CHUNK)]
+    print(f"{run}: {checkpoint['encoder']} trained on {checkpoint['task']} with {checkpoint['distractors']} distractors, "
+          f"{checkpoint['frames']} frames, {'mean' if mean_actions else 'sampled'} actions")
+    print("   N  episodes  success (axis-aligned)  success (strict)  solved  cut short")
+    with multiprocessing.get_context("spawn").Pool(min(os.cpu_count(), len(chunks) or 1)) as pool:
+        parts = pool.starmap(play, [(run, *chunk, mean_actions) for chunk in chunks], chunksize=1)
+    rows = []
+    for n in distractors:
+        rows.append(summary(n, [r for chunk, part in zip(chunks, parts) if chunk[0] == n for r in part]))
+        print("{distractors:4d} {episodes:9d}        {success_aabb:.3f} +- {ci95:.3f}    {success_strict:.3f} +- {ci95_strict:.3f}   "
+              "{solved:.3f} {cut_short:10d}".format(**rows[-1]), flush=True)
+    if rows and os.path.isdir(run):
+        path = os.path.join(run, "zeroshot-mean.csv" if mean_actions else "zeroshot.csv")
+        lines = {row["distractors"]: [str(row[key]) if isinstance(row[key], int) else f"{row[key]:.4f}" for key in COLUMNS] for row in rows}
+        if os.path.exists(path):                               # rows of other N stay
+            with open(path, newline="") as file:
+                lines = {**{int(line[0]): line for line in list(csv.reader(file))[1:]}, **lines}
+        with open(path, "w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([COLUMNS, *(lines[n] for n in sorted(lines))])
+    return rows
+
+
+def read(run, name):
+    """Columns of a CSV of a run folder as float arrays; ValueError if the file is missing or empty."""
+    path = os.path.join(run, name)
+    try:
+        with open(path, newline="") as file:
+            rows = list(csv.DictReader(file))
+        return {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
+    except (OSError, IndexError, TypeError, ValueError):
+        raise ValueError(f"{path} is missing or not a CSV of this project") from None
+
+
+def plot(runs, path):
+    """Training curves (left) and zero-shot curves (right, with 95 % intervals) of the runs, as in figure 3."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise ValueError("--plot needs matplotlib: pip install matplotlib") from None
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    for run in runs:
+        label, progress = os.path.basename(os.path.normpath(run)), read(run, "progress.csv")
+        window = min(20, len(progress["frames"]))
+        for key, style in (("success_aabb", "-"), ("success_strict", ":")):
+            smooth = np.convolve(progress[key], np.ones(window) / window, "valid")
+            line, = left.plot(progress["frames"][window - 1:] / 1e6, smooth, style, label=label if style == "-" else None,
+                              color=None if style == "-" else line.get_color())
+        if os.path.exists(os.path.join(run, "zeroshot.csv")):
+            rows = read(run, "zeroshot.csv")
+            right.errorbar(rows["distractors"], rows["success_aabb"], rows["ci95"], marker="o", capsize=3, color=line.get_color(), label=label)
+            right.plot(rows["distractors"], rows["success_strict"], ":", color=line.get_color())
+    left.set(xlabel="million frames", ylabel="fractional success, last step", title=f"training (mean of {window} updates)")
+    right.set(xlabel="distractors at test time", title="zero-shot (solid: axis-aligned, dotted: strict)")
+    for axes in (left, right):
+        axes.set_ylim(0, 1)
+        axes.grid(alpha=0.3)
+        axes.legend()
+    figure.savefig(path, dpi=120)
+    print(f"wrote {path}")
+
+
+@torch.inference_mode()
+def film(run, distractors, path, episode=0):
+    """Write one evaluation episode, played with sampled actions, as an animated GIF."""
+    try:
+        from PIL import Image
+    except ImportError:
+        raise ValueError("--gif needs pillow: pip install pillow") from None
+    checkpoint, agent = load(run)
+    env = make_env(checkpoint["task"], distractors, checkpoint["settings"], render_mode="rgb_array")
+    noise = np.random.default_rng(episode_seed(episode))
+    (obs, info), frames, truncated = env.reset(seed=episode_seed(episode)), [], False
+    every = max(1, round(0.08 / (env.substeps * env.timestep)))                # 12 pictures a second
+    while not truncated:
+        if len(frames) * every <= env._steps:
+            frames.append(Image.fromarray(env.render(320, 240)))
+        mean, log_std, _ = agent({key: torch.from_numpy(value)[None] for key, value in obs.items()})
+        obs, _, _, truncated, info = env.step(mean[0].numpy() + log_std.exp().numpy() * noise.standard_normal(9))
+    env.close()
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=80, loop=0)
+    print(f"wrote {path}: {distractors} distractors, fractional success {info['fractional_success']:.2f}")
+
+
+def parse_range(text):
+    """'0-9' or '2,5,14' or a mix: the sorted list of N."""
+    try:
+        numbers = set()
+        for part in text.split(","):
+            low, _, high = part.partition("-")
+            numbers.update(range(int(low), int(high or low) + 1))
+    except ValueError:
+        fail(f"--distractors must look like 0-9 or 0,2,5, got {text!r}")
+    if not numbers:
+        fail(f"--distractors {text!r} names no number")
+    return sorted(numbers)
+
+
+def main():
+    parser = argparse.ArgumentParser(description="Play trained agents zero-shot at other N (see the first lines of evaluate.py).")
+    parser.error = fail
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder of train.py")
+    parser.add_argument("--distractors", default="0-9", metavar="LIST", help="numbers of distractors, as 0-9 or 0,2,14 (default 0-9)")
+    parser.add_argument("--episodes", type=int, default=200, metavar="E", help="episodes at each N; 0: do not play (default 200)")
+    parser.add_argument("--mean-actions", action="store_true", help="play the mean of the policy instead of sampling")
+    parser.add_argument("--plot", metavar="FILE", help="draw training and zero-shot curves of all runs from their CSV files")
+    parser.add_argument("--gif", metavar="FILE", help="film an episode of the first run at the first N")
+    args = parser.parse_args()
+    numbers = parse_range(args.distractors)
+    if args.episodes < 0:
+        fail(f"--episodes must be at least 0, got {args.episodes}")
+    try:
+        for run in args.runs:
+            checkpoint, _ = load(run)
+            make_env(checkpoint["task"], numbers[-1], checkpoint["settings"]).close()      # refuses an N that is too large
+        for run in args.runs if args.episodes else ():
+            evaluate(run, numbers, args.episodes, args.mean_actions)
+        if args.plot:
+            plot(args.runs, args.plot)
+        if args.gif:
+            film(args.runs[0], numbers[0], args.gif)
+    except (ValueError, OSError) as error:
+        fail(str(error))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,665 @@
+"""Tests of everything, each against something independent: a slow loop, torch's own layer, PyBullet, a hand-computed case.
+
+Run:    pytest -q        under 3 minutes on 2 cores
+"""
+import csv
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pybullet as pb
+import pytest
+import torch
+from torch import nn
+
+import evaluate
+import train
+import trifinger_env as tri
+from attn import ATTN
+from lrn import LRN
+from ppo import PPO, PointOnLine, TinyAgent, gae, normal_log_prob
+from rn import RN
+from trifinger_env import TriFingerEnv
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+D = 64
+torch.set_num_threads(1)
+
+
+def some(B, K, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(B, K, D, generator=generator), torch.randn(B, D, generator=generator)
+
+
+def run(*command, cwd=HERE, timeout=120, **more):
+    """A command of the project in a process of its own; output as text."""
+    return subprocess.run([sys.executable, *command], cwd=cwd, timeout=timeout, capture_output=True, text=True, **more)
+
+
+# ---------------------------------------------------------------- encoders
+
+def g_slow(encoder, pair):
+    """g_theta on one concatenated pair, layer by layer, without the split of the first layer."""
+    return encoder.g(torch.nn.functional.linear(pair, encoder.first.weight, encoder.first.bias))
+
+
+def test_lrn_equals_the_loop_over_objects():
+    encoder, (objects, goal) = LRN(), some(3, 6)
+    for b in range(3):
+        total = sum(g_slow(encoder, torch.cat([objects[b, i], goal[b]])) for i in range(6))
+        z = nn.functional.layer_norm(total @ encoder.f.weight.T + encoder.f.bias, (25,))
+        torch.testing.assert_close(encoder(objects, goal)[b], z, atol=1e-5, rtol=1e-4)
+
+
+def test_rn_equals_the_double_loop_over_pairs():
+    encoder, (objects, goal) = RN(), some(2, 5)
+    for b in range(2):
+        tokens = [*objects[b], goal[b]]
+        total = sum(g_slow(encoder, torch.cat([first, second])) for first in tokens for second in tokens)
+        z = nn.functional.layer_norm(total @ encoder.f.weight.T + encoder.f.bias, (25,))
+        torch.testing.assert_close(encoder(objects, goal)[b], z, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("heads", [1, 4])
+def test_attention_equals_torch_multihead_attention(heads):
+    encoder, (objects, goal) = ATTN(heads=heads), some(3, 6)
+    torchs = nn.MultiheadAttention(D, heads, batch_first=True)
+    with torch.no_grad():
+        torchs.in_proj_weight.copy_(torch.cat([encoder.q.weight, encoder.k.weight, encoder.v.weight]))
+        torchs.in_proj_bias.copy_(torch.cat([encoder.q.bias, encoder.k.bias, encoder.v.bias]))
+        torchs.out_proj.weight.copy_(torch.eye(D))             # the paper's equation has no output projection
+        torchs.out_proj.bias.zero_()
+    tokens = torch.cat([objects, goal[:, None]], 1)
+    expected, weights = torchs(tokens, tokens, tokens, average_attn_weights=False)
+    attended, ours = encoder.attend(objects, goal)
+    torch.testing.assert_close(attended, expected, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(ours, weights, atol=1e-6, rtol=1e-4)
+    z = nn.functional.layer_norm(expected.sum(1) @ encoder.f.weight.T + encoder.f.bias, (25,))
+    torch.testing.assert_close(encoder(objects, goal), z, atol=1e-4, rtol=1e-4)
+
+
+def test_ablations_of_lrn_equal_their_formulas():
+    objects, goal = some(2, 5)
+    alone = LRN(relations=False)
+    total = sum(g_slow(alone, objects[:, i]) for i in range(5))
+    torch.testing.assert_close(alone(objects, goal), nn.functional.layer_norm(alone.f(total), (25,)), atol=1e-5, rtol=1e-4)
+    mean = LRN(layer_norm=False, z_dim=10)
+    r = sum(g_slow(mean, torch.cat([objects[:, i], goal], 1)) for i in range(5)) / 5
+    torch.testing.assert_close(mean(objects, goal), mean.f(r), atol=1e-5, rtol=1e-4)
+    assert mean(objects, goal).shape == (2, 10)
+
+
+@pytest.mark.parametrize("make", [LRN, RN, ATTN, lambda: LRN(layer_norm=False), lambda: LRN(relations=False)])
+def test_encoder_ignores_order_and_padding_and_serves_any_number(make):
+    encoder, other = make(), make()
+    other.load_state_dict(encoder.state_dict())
+    for K in range(1, 21):
+        objects, goal = some(2, K, seed=K)
+        z = encoder(objects, goal)
+        assert z.shape == (2, encoder.f.out_features) and torch.equal(z, other(objects, goal))
+        torch.testing.assert_close(z, encoder(objects[:, torch.randperm(K)], goal), atol=1e-4, rtol=1e-4)
+        padded = torch.cat([objects, 1e3 * torch.randn(2, 3, D)], 1)
+        present = torch.arange(K + 3).expand(2, -1) < K
+        torch.testing.assert_close(z, encoder(padded, goal, present), atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("make", [LRN, RN, ATTN])
+def test_gradient_reaches_every_parameter(make):
+    encoder, (objects, goal) = make(), some(8, 6)
+    (encoder(objects, goal) * torch.randn(8, 25)).sum().backward()
+    for name, p in encoder.named_parameters():
+        if name != "k.bias":                                   # adds the same score to every key, so softmax drops it
+            assert p.grad.abs().max() > 1e-6, name
+
+
+def test_relations_grow_linearly_in_lrn_and_quadratically_in_rn():
+    """Rows that pass through g_theta, counted at its second layer; the paper's 12 and 169 at 9 cubes and 3 fingers."""
+    for encoder, expected in ((LRN(), {6: 6, 12: 12, 24: 24}), (RN(), {6: 49, 12: 169, 24: 625})):
+        rows = []
+        encoder.g[1].register_forward_hook(lambda module, inputs, output: rows.append(output.numel() // D))
+        for K, count in expected.items():
+            encoder(*some(1, K))
+            assert rows[-1] == count
+
+
+@pytest.mark.parametrize("kind", ["lrn", "rn", "attn"])
+def test_z_varies_with_the_state_from_the_start(kind):
+    """PyTorch's default initialisation gives LRN and RN a z that is nearly constant over states; ours must not."""
+    torch.manual_seed(0)
+    agent, env = train.Agent(kind, 2, {key: value[0] for key, value in train.SETTINGS.items()}), TriFingerEnv()
+    observations = [env.reset(seed=s)[0] for s in range(40)]
+    env.close()
+    obs = {key: torch.from_numpy(np.stack([o[key] for o in observations])) for key in observations[0]}
+    ours = agent.encode(obs).std(0).mean().item()
+    for module in agent.modules():
+        if isinstance(module, nn.Linear):
+            module.reset_parameters()
+    default = agent.encode(obs).std(0).mean().item()
+    assert ours > 0.06 and ours > (2 if kind == "attn" else 5) * default, (ours, default)
+
+
+# ---------------------------------------------------------------- environment
+
+@pytest.fixture(scope="module")
+def env():
+    env = TriFingerEnv()
+    env.reset(seed=0)
+    yield env
+    env.close()
+
+
+def test_kinematics_against_pybullet_and_inverse(env):
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        q = rng.uniform(np.array(tri.LOWER * 3), np.array(tri.UPPER * 3))
+        for j in range(9):
+            pb.resetJointState(env._robot, j, q[j], physicsClientId=env._client)
+        for k in range(3):
+            state = pb.getLinkState(env._robot, 3 * k + 2, computeForwardKinematics=1, physicsClientId=env._client)
+            tip = pb.multiplyTransforms(state[4], state[5], [0, -0.008, -0.16], [0, 0, 0, 1])[0]
+            ours = tri.forward_kinematics(k, q[3 * k:3 * k + 3])
+            np.testing.assert_allclose(ours, tip, atol=1e-6)
+    for q in rng.uniform([-1.0, -0.8, -2.4], [0.8, 0.8, -0.1], (50, 3)):
+        for k in range(3):
+            tip = tri.forward_kinematics(k, q)
+            np.testing.assert_allclose(tri.forward_kinematics(k, tri.inverse_kinematics(k, tip)), tip, atol=1e-9)
+    with pytest.raises(ValueError, match="cannot reach"):
+        tri.inverse_kinematics(0, (1.0, 0.0, 0.0))
+
+
+def test_friction_of_a_cube_on_the_floor(env):
+    """A cube slides once a sideways force exceeds mu m g, with mu = 1.0 x 0.5; it stays below."""
+    c = {"physicsClientId": env._client}
+    for share, slides in ((0.9, False), (1.1, True)):
+        env.reset(seed=1)
+        cube = env._cubes[0]
+        pb.resetBasePositionAndOrientation(cube, [0, 0, tri.CUBE / 2], [0, 0, 0, 1], **c)
+        for body in env._cubes[1:]:
+            pb.resetBasePositionAndOrientation(body, [0.15, 0.1, 1 + body], [0, 0, 0, 1], **c)
+        for j in range(9):
+            pb.resetJointState(env._robot, j, (0.0, 1.4, -1.0)[j % 3], **c)
+        force = share * 0.5 * tri.CUBE_MASS * 9.81
+        for _ in range(60):
+            at = pb.getBasePositionAndOrientation(cube, **c)[0]
+            pb.applyExternalForce(cube, -1, [force, 0, 0], at, pb.WORLD_FRAME, **c)
+            pb.stepSimulation(**c)
+        moved = pb.getBasePositionAndOrientation(cube, **c)[0][0]
+        assert (moved > 0.01) == slides, moved
+
+
+def turn(axis, angle):
+    return tuple(math.sin(angle / 2) * np.array(axis, float)) + (math.cos(angle / 2),)
+
+
+def test_overlap_against_hand_computed_cases():
+    side, still, z = tri.CUBE, (0.0, 0.0, 0.0, 1.0), tri.CUBE / 2
+    goal = ((0.0, 0.0, z), still)
+    for cube, aabb, strict in (
+            (goal, 1.0, 1.0),
+            (((0.013, 0.0, z), still), 0.8, 0.8),                                      # 13 mm of 65 mm
+            (((side / 2, side / 2, z + side / 2), still), 0.125, 0.125),
+            (((side, 0.0, z), still), 0.0, 0.0),
+            (((0.0, 0.0, z), turn((0, 0, 1), math.pi / 4)), 1.0, 2 * (math.sqrt(2) - 1)),    # an octagon of the square
+            (((0.01, 0.0, z), turn((0, 0, 1), math.pi / 4)), 1.0, None),               # lenient: still 1.0, 1 cm off
+            (((0.0, 0.0, z), turn((1, 0, 0), math.pi / 2)), 1.0, 1.0)):
+        assert tri.aabb_overlap(cube, goal) == pytest.approx(aabb, abs=1e-9)
+        if strict is not None:
+            assert tri.oriented_overlap(cube, goal) == pytest.approx(strict, abs=1e-9)
+
+
+def test_overlap_against_monte_carlo_volumes():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (100_000, 3)) * tri.CUBE                           # inside the goal cube, its own frame
+    for _ in range(12):
+        quaternions = rng.normal(size=(2, 4))
+        cube, goal = ((tuple(p), tuple(q / np.linalg.norm(q))) for p, q in zip(rng.uniform(-0.025, 0.025, (2, 3)), quaternions))
+        world = points @ tri.rotation(goal[1]).T + goal[0]
+        inside = (np.abs((world - cube[0]) @ tri.rotation(cube[1])) < tri.CUBE / 2).all(1).mean()
+        assert tri.oriented_overlap(cube, goal) == pytest.approx(inside, abs=0.006)
+        half = np.abs(tri.rotation(goal[1])).sum(1) * tri.CUBE / 2
+        world = points / tri.CUBE * 2 * half + goal[0]
+        inside = (np.abs(world - cube[0]) < np.abs(tri.rotation(cube[1])).sum(1) * tri.CUBE / 2).all(1).mean()
+        assert tri.aabb_overlap(cube, goal) == pytest.approx(inside, abs=0.006)
+
+
+def test_observation_is_table_1(env):
+    """Every entry against PyBullet's own state, with the scaling undone."""
+    env.reset(seed=3)
+    for _ in range(10):
+        obs, *_ = env.step(np.full(9, 0.5))
+    assert {key: (value.shape, value.dtype) for key, value in obs.items()} == {
+        "cubes": ((3, 18), np.float32), "fingers": ((3, 10), np.float32), "goal": ((12,), np.float32)}
+    c = {"physicsClientId": env._client}
+    for cube, row, identifier in zip(env._cubes, obs["cubes"] * tri.CUBE_SCALE, env._ids):
+        position, quaternion = pb.getBasePositionAndOrientation(cube, **c)
+        linear, angular = pb.getBaseVelocity(cube, **c)
+        quaternion = np.array(quaternion) * (1 if quaternion[3] >= 0 else -1)
+        np.testing.assert_allclose(row, [1, *[tri.CUBE] * 3, *position, *quaternion, *linear, *angular, identifier], atol=1e-5)
+    states = pb.getJointStates(env._robot, range(9), **c)
+    for k, row in enumerate(obs["fingers"] * tri.FINGER_SCALE):
+        q, dq = ([state[i] for state in states[3 * k:3 * k + 3]] for i in (0, 1))
+        np.testing.assert_allclose(row, [*q, *dq, k - 1, *tri.forward_kinematics(k, q)], atol=1e-5)
+    np.testing.assert_allclose(obs["goal"] * tri.GOAL_SCALE, [1, *[tri.CUBE] * 3, *env.goal[0], *env.goal[1], env._ids[env.target]], atol=1e-5)
+    assert (obs["cubes"][:, -1] == obs["goal"][-1]).sum() == 1 and len(set(env._ids)) == 3
+    # the scaling itself, in numbers: 0.2 m, 1.5 rad and a cube's edge are 1
+    np.testing.assert_allclose(obs["cubes"][0, [1, 4, 5, 6]], [1, *np.array(env._poses[0][0]) / 0.2], atol=1e-5)
+    np.testing.assert_allclose(obs["fingers"][1, [0, 6, 9]], [states[3][0] / 1.5, 0, env._tips[1][2] / 0.2], atol=1e-5)
+    np.testing.assert_allclose(obs["goal"][[4, 10, 11]], [env.goal[0][0] / 0.2, 1, env._ids[env.target]], atol=1e-5)
+
+
+def test_reward_terms_add_up_and_follow_their_formulas():
+    weights = {"overlap": 100.0, "distance": 250.0, "curiosity": 10.0, "reach": 7.0}
+    env = TriFingerEnv(distractors=1, reward_weights=weights)
+    env.reset(seed=0)
+    for t in range(30):
+        before, tips = env._poses[env.target][0], np.array(env._tips)
+        _, reward, _, _, info = env.step(np.sin(np.arange(9) + t / 3))
+        after, rho, goal = env._poses[env.target][0], tri.aabb_overlap(env._poses[env.target], env.goal), env.goal[0]
+        expected = {"overlap": 100 * rho, "distance": 250 * (math.dist(before, goal) - math.dist(after, goal)),
+                    "curiosity": 10 * (1 - rho) ** 0.05 * math.log(math.dist(before, after) + 1e-5),
+                    "reach": 7 * (np.linalg.norm(tips - before) - np.linalg.norm(np.array(env._tips) - after))}
+        assert info["rewards"] == pytest.approx(expected, abs=1e-9)
+        assert reward == pytest.approx(sum(expected.values()), abs=1e-9)
+        assert info["fractional_success"] == rho
+    env.close()
+
+
+def test_distance_term_pays_for_moving_towards_the_goal(env):
+    for sign in (1, -1):
+        env.reset(seed=2)
+        cube, (position, _) = env._cubes[env.target], env._poses[env.target]
+        towards = np.subtract(env.goal[0], position)
+        pb.resetBaseVelocity(cube, list(sign * 0.3 * towards / np.linalg.norm(towards)), [0, 0, 0], physicsClientId=env._client)
+        assert sign * env.step(np.zeros(9))[4]["rewards"]["distance"] > 0
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 5, 9, 14, 20])
+def test_resets_never_overlap_and_follow_one_law(n):
+    """Corners checked by sampling points on the edges: no cube inside another, on the goal, in a finger, beyond the wall."""
+    env = TriFingerEnv(distractors=n)
+    env.reset(seed=0)
+    edge = np.linspace(-0.5, 0.5, 14) * tri.CUBE
+    rim = np.array([(x, y) for x in edge for y in edge if max(abs(x), abs(y)) > tri.CUBE * 0.49])
+    for _ in range(2 if n > 14 else 30):
+        env._rng = np.random.default_rng(env._rng.integers(2 ** 32))
+        poses = env._place()
+        assert poses.shape == (n + 2, 3) and np.hypot(*poses[:2, :2].T).max() <= tri.REACH
+        outlines = [np.stack([x + np.cos(a) * rim[:, 0] - np.sin(a) * rim[:, 1], y + np.sin(a) * rim[:, 0] + np.cos(a) * rim[:, 1]], 1)
+                    for x, y, a in poses]
+        tips = np.array([tri.forward_kinematics(k, tri.REST)[:2] for k in range(3)])
+        for i, (x, y, a) in enumerate(poses):
+            others = np.concatenate([outline for j, outline in enumerate(outlines) if j != i] + [tips]) - [x, y]
+            local = np.stack([np.cos(a) * others[:, 0] + np.sin(a) * others[:, 1], -np.sin(a) * others[:, 0] + np.cos(a) * others[:, 1]], 1)
+            assert (np.abs(local).max(1) > tri.CUBE / 2).all()
+            assert np.hypot(*outlines[i].T).max() < tri.WALL
+    env.close()
+
+
+def test_goal_and_target_do_not_depend_on_the_number_of_distractors():
+    starts = []
+    for n in (0, 2, 9):
+        env = TriFingerEnv(distractors=n)
+        env.reset(seed=11)
+        starts.append((env.goal[0][:2], env._poses[env.target][0][:2]))
+        env.close()
+    assert np.ptp(np.array(starts), 0).max() == 0
+
+
+def test_lifting_goals_reach_up_to_20_cm():
+    env = TriFingerEnv("lift", 0)
+    heights = []
+    for _ in range(100):
+        env.reset(seed=0 if not heights else None)
+        heights.append(env.goal[0][2])
+    env.close()
+    assert tri.CUBE / 2 <= min(heights) < 0.06 and 0.18 < max(heights) <= 0.2
+
+
+@pytest.mark.parametrize("n", [0, 2])
+def test_same_seed_same_trajectory_bit_for_bit(n):
+    def trajectory(env, seed):
+        rng, obs = np.random.default_rng(seed), [env.reset(seed=seed)[0]]
+        for _ in range(120):
+            obs.append(env.step(np.sign(rng.uniform(-1, 1, 9)))[0])
+        return np.array([np.concatenate([value.ravel() for value in o.values()]) for o in obs])
+    used, fresh = TriFingerEnv(distractors=n), TriFingerEnv(distractors=n)
+    for seed in (0, 1, 2):
+        trajectory(used, seed)
+    assert np.array_equal(trajectory(used, 7), trajectory(fresh, 7))
+    assert not np.array_equal(trajectory(used, 7), trajectory(fresh, 8))
+    used.close(), fresh.close()
+
+
+def test_episode_ends_by_truncation_with_a_named_reason():
+    env = TriFingerEnv(episode_steps=5)
+    env.reset(seed=0)
+    results = [env.step(np.zeros(9)) for _ in range(5)]
+    assert [result[3] for result in results] == [False] * 4 + [True] and not any(result[2] for result in results)
+    assert results[-1][4]["truncated_by"] == "time" and 0 <= results[-1][4]["fractional_success_strict"] <= 1
+    assert type(results[0][2]) is bool and type(results[0][3]) is bool and type(results[0][1]) is float
+    env.reset()
+    pb.resetBasePositionAndOrientation(env._cubes[0], [0.5, 0, 0.1], [0, 0, 0, 1], physicsClientId=env._client)
+    assert env.step(np.zeros(9))[4]["truncated_by"] == "a cube left the arena"
+    env.reset()
+    pb.resetBaseVelocity(env._cubes[1], [float("nan")] * 3, physicsClientId=env._client)
+    assert env.step(np.zeros(9))[4]["truncated_by"] == "the physics diverged"
+    env.close()
+
+
+def test_bad_arguments_and_actions_are_refused():
+    for arguments, words in (({"task": "fly"}, "task"), ({"distractors": -1}, "distractors"), ({"distractors": 1.5}, "distractors"),
+                             ({"distractors": 21}, "holds 21 cubes"), ({"reward_weights": {"joy": 1}}, "joy"), ({"episode_steps": 0}, "positive"),
+                             ({"action_mode": "torque"}, "action_mode"), ({"render_mode": "ascii"}, "render_mode")):
+        with pytest.raises(ValueError, match=words):
+            TriFingerEnv(**arguments)
+    env = TriFingerEnv(distractors=0)
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step(np.zeros(9))
+    env.reset(seed=0)
+    for action in (np.full(9, np.nan), np.zeros(8), np.zeros((1, 9)), "left", None, [np.inf] + [0] * 8, 3):
+        with pytest.raises(ValueError, match="nine finite numbers"):
+            env.step(action)
+    far, near = TriFingerEnv(distractors=0), env
+    far.reset(seed=5), near.reset(seed=5)
+    assert np.array_equal(far.step(np.full(9, 50.0))[0]["fingers"], near.step(np.ones(9))[0]["fingers"])     # clipped
+    far.close(), near.close(), near.close()
+
+
+def test_paper_rate_is_available():
+    env = TriFingerEnv(episode_steps=2500, substeps=3, timestep=0.004, action_mode="absolute", distractors=0)
+    env.reset(seed=0)
+    for t in range(2500):
+        truncated, info = env.step(np.zeros(9))[3:]
+        assert truncated == (t == 2499)
+    env.close()
+
+
+def test_picture_shows_target_goal_and_distractors_in_their_colours():
+    env = TriFingerEnv(render_mode="rgb_array")
+    env.reset(seed=3)
+    image = env.render().astype(int)
+    env.close()
+    assert image.shape == (360, 480, 3)
+    r, g, b = image[..., 0], image[..., 1], image[..., 2]
+    blue, red, green = (b > r + 60) & (b > g + 40), (r > g + 60) & (r > b + 60), (g > r + 25) & (g > b + 25)
+    assert min(blue.sum(), red.sum(), green.sum()) > 200, (blue.sum(), red.sum(), green.sum())
+
+
+def test_gymnasium_check_env():
+    gymnasium = pytest.importorskip("gymnasium", reason="gymnasium is not installed (optional)")
+    from gymnasium.utils.env_checker import check_env
+
+    class Adapter(gymnasium.Env):
+        metadata = TriFingerEnv.metadata
+
+        def __init__(self):
+            self.inner, box, self.render_mode = TriFingerEnv(), gymnasium.spaces.Box, None
+            self.action_space = box(-1, 1, (9,), np.float32)
+            self.observation_space = gymnasium.spaces.Dict({key: box(-np.inf, np.inf, value.shape, np.float32)
+                                                            for key, value in self.inner.reset(seed=0)[0].items()})
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self.inner.reset(seed=seed, options=options)
+
+        def step(self, action):
+            return self.inner.step(action)
+
+    check_env(Adapter(), skip_render_check=True)
+
+
+# ---------------------------------------------------------------- PPO
+
+def test_gae_against_a_hand_computed_table():
+    """discount 0.5, lambda 0.5; column 0 terminates at t=1, column 1 is truncated at t=1, both run on at t=2."""
+    both = torch.tensor
+    rewards, values = both([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]]), both([[4.0, 4.0], [2.0, 2.0], [1.0, 1.0]])
+    next_values = both([[2.0, 2.0], [8.0, 8.0], [6.0, 6.0]])
+    terminated, done = both([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]), both([[0.0, 0.0], [1.0, 1.0], [0.0, 0.0]])
+    # t=2: 3 + 0.5*6 - 1 = 5.  t=1: terminated 2 - 2 = 0; truncated 2 + 0.5*8 - 2 = 4.  t=0: 1 + 0.5*2 - 4 = -2, + 0.25 * A_1
+    expected = both([[-2.0, -1.0], [0.0, 4.0], [5.0, 5.0]])
+    torch.testing.assert_close(gae(rewards, values, next_values, terminated, done, 0.5, 0.5), expected)
+
+
+def test_log_prob_and_entropy_against_torch_distributions():
+    mean, log_std, actions = torch.randn(5, 9), torch.randn(9), torch.randn(5, 9)
+    normal = torch.distributions.Normal(mean, log_std.exp())
+    torch.testing.assert_close(normal_log_prob(actions, mean, log_std), normal.log_prob(actions).sum(-1))
+    learner = PPO(TinyAgent(), [PointOnLine()], steps=8, minibatches=1)
+    obs = {"x": torch.randn(8, 2)}
+    stats = learner.loss(obs, torch.randn(8, 1), torch.zeros(8), torch.randn(8), torch.randn(8), 0.2)[1]
+    assert stats["entropy"].item() == pytest.approx(torch.distributions.Normal(0, learner.agent.log_std.exp()).entropy().item(), abs=1e-5)
+
+
+class Counter:
+    """Observation t, reward 10 * episode + t; episodes end after 3 steps, by termination or truncation."""
+    def __init__(self, terminates):
+        self.terminates, self.episode = terminates, -1
+
+    def reset(self, *, seed=None, options=None):
+        self.t, self.episode = 0, self.episode + 1
+        return {"x": np.array([0.0, self.episode], np.float32)}, {}
+
+    def step(self, action):
+        self.t += 1
+        end = self.t == 3
+        return {"x": np.array([self.t, self.episode], np.float32)}, 10.0 * self.episode + self.t, end and self.terminates, end and not self.terminates, {}
+
+
+@pytest.mark.parametrize("terminates", [True, False])
+def test_rollout_stores_what_happened(terminates):
+    """Rewards sit at their step, and an episode's last value comes from its own final observation."""
+    agent = TinyAgent()
+    learner = PPO(agent, [Counter(terminates)], steps=5, minibatches=1, lam=1.0, discount=0.5, normalize_values=False)
+    episodes = learner.rollout([0])
+    assert learner.buffer["x"][:, 0].tolist() == [[0, 0], [1, 0], [2, 0], [0, 1], [1, 1]]
+    assert [(e[0], e[1]) for e in episodes] == [(6.0, 3)]
+    with torch.no_grad():
+        final, last = (agent.value(torch.tensor(x)).item() for x in ([3.0, 0.0], [2.0, 1.0]))
+    future = 0.0 if terminates else final
+    expected = [1 + 0.5 * (2 + 0.5 * (3 + 0.5 * future)), 2 + 0.5 * (3 + 0.5 * future), 3 + 0.5 * future,
+                11 + 0.5 * (12 + 0.5 * last), 12 + 0.5 * last]
+    assert learner.batch["returns"][:, 0].tolist() == pytest.approx(expected, abs=1e-5)
+
+
+def test_ppo_solves_the_line():
+    """Best possible: about 3.6 moves of 0.2 to a random target; a random policy ends more than 0.5 away."""
+    torch.manual_seed(0)
+    learner = PPO(TinyAgent(), [PointOnLine() for _ in range(8)], steps=64, lr=3e-3)
+    gaps = []
+    for update in range(25):
+        episodes = learner.rollout([1000 * update + e for e in range(8)])
+        stats = learner.update(1 - update / 25)
+        gaps.append(np.mean([e[2]["gap"] for e in episodes]))
+    assert gaps[0] > 0.3 and np.mean(gaps[-5:]) < 0.1, gaps
+    assert stats["approx_kl"] >= 0 and stats["explained_variance"] > 0.5
+
+
+def test_ppo_refuses_a_batch_that_does_not_divide_and_a_loss_that_is_not_finite():
+    with pytest.raises(ValueError, match="divide"):
+        PPO(TinyAgent(), [PointOnLine()] * 3, steps=5, minibatches=4)
+    learner = PPO(TinyAgent(), [PointOnLine()], steps=16, minibatches=2)
+    learner.rollout([0])
+    learner.batch["returns"][3] = float("nan")
+    before = [p.clone() for p in learner.agent.parameters()]
+    with pytest.raises(FloatingPointError):
+        learner.update(1.0)
+    assert all(torch.equal(p, q) for p, q in zip(before, learner.agent.parameters()))
+
+
+TWO_RANKS = """
+import sys, torch, torch.distributed as dist
+sys.path.insert(0, {here!r})
+from ppo import PPO, PointOnLine, TinyAgent
+
+def learner(envs):
+    torch.manual_seed(0)
+    return PPO(TinyAgent(), [PointOnLine() for _ in range(envs)], steps=32, epochs=1, minibatches=1, lr=1e-2)
+
+def rank(r, path):
+    dist.init_process_group("gloo", init_method="file://" + path, rank=r, world_size=2)
+    both = learner(4)
+    both.rollout([0, 1, 2, 3])
+    mine = learner(2)
+    mine.rollout([2 * r, 2 * r + 1])
+    for store in ("buffer", "batch"):                        # the same samples: this rank's half of the joined batch
+        for key, value in getattr(mine, store).items():
+            value.copy_(getattr(both, store)[key][:, 2 * r:2 * r + 2])
+    mine.update(1.0)
+    got = torch.cat([p.grad.flatten() for p in mine.agent.parameters()])
+    dist.destroy_process_group()
+    both.update(1.0)
+    want = torch.cat([p.grad.flatten() for p in both.agent.parameters()])
+    assert torch.allclose(got, want, rtol=1e-4, atol=1e-6), (got - want).abs().max()
+    assert want.abs().max() > 1e-3
+
+if __name__ == "__main__":
+    torch.multiprocessing.spawn(rank, ({store!r},), 2)
+"""
+
+
+def test_two_ranks_give_the_gradient_of_one_on_the_joined_batch(tmp_path):
+    script = tmp_path / "two.py"
+    script.write_text(TWO_RANKS.format(here=HERE, store=str(tmp_path / "store")))
+    done = run(str(script))
+    assert done.returncode == 0, done.stderr
+
+
+# ---------------------------------------------------------------- training and evaluation
+
+SMALL = ["--set", "envs=4", "steps=50", "episode_steps=50", "minibatches=4"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A short real training run on two ranks, with the reach term only."""
+    out = str(tmp_path_factory.mktemp("run") / "lrn")
+    done = run("train.py", "--encoder", "lrn", "--distractors", "0", "--ranks", "2", "--frames", "16000", "--out", out, "--set", "envs=8",
+               "steps=50", "episode_steps=50", "minibatches=4", "lr=0.002", "reward_overlap=0", "reward_distance=0")
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def mean_gap(agent, settings, episodes=24):
+    """Mean distance (m) of the nearest fingertip to the cube's centre over the last steps of sampled episodes."""
+    env, rng, gaps = train.make_env("push", 0, settings), np.random.default_rng(0), []
+    for episode in range(episodes):
+        obs, truncated = env.reset(seed=1000 + episode)[0], False
+        while not truncated:
+            with torch.no_grad():
+                mean, log_std, _ = agent({key: torch.from_numpy(value)[None] for key, value in obs.items()})
+                action = mean[0].numpy() + log_std.exp().numpy() * rng.standard_normal(9)
+            obs, _, _, truncated, _ = env.step(action)
+        gaps.append(np.linalg.norm(np.array(env._tips) - env._poses[env.target][0], axis=1).mean())
+    env.close()
+    return np.mean(gaps)
+
+
+def test_training_lowers_the_distance_from_fingertips_to_cube(trained):
+    checkpoint, agent = train.load(trained)
+    torch.manual_seed(0)
+    untrained = train.Agent("lrn", 0, checkpoint["settings"])
+    before, after = mean_gap(untrained, checkpoint["settings"]), mean_gap(agent, checkpoint["settings"])
+    assert after < 0.85 * before, (before, after)
+    with open(os.path.join(trained, "progress.csv")) as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["update"]) for row in rows] == list(range(1, 41)) and int(rows[-1]["frames"]) == 16000
+
+
+def test_checkpoint_evaluates_at_other_numbers_of_distractors(trained):
+    done = run("evaluate.py", trained, "--distractors", "0,3", "--episodes", "6")
+    assert done.returncode == 0, done.stderr
+    rows = evaluate.read(trained, "zeroshot.csv")
+    assert rows["distractors"].tolist() == [0, 3] and rows["episodes"].tolist() == [6, 6]
+    first = (evaluate.play(trained, 3, 0, 6, False), evaluate.summary(3, evaluate.play(trained, 3, 0, 6, False)))
+    assert first[1]["success_aabb"] == pytest.approx(rows["success_aabb"][1], abs=1e-4)      # the same numbers again
+    assert np.mean([result[0] for result in first[0]]) == pytest.approx(first[1]["success_aabb"])
+
+
+def test_plot_and_film(trained, tmp_path):
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed (optional)")
+    done = run("evaluate.py", trained, "--episodes", "0", "--distractors", "1", "--plot", str(tmp_path / "a.png"), "--gif", str(tmp_path / "a.gif"))
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "a.png").stat().st_size > 10_000 and (tmp_path / "a.gif").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("kind", ["rn", "attn", "mlp"])
+def test_other_encoders_train_and_the_mlp_says_why_it_cannot_change_n(kind, tmp_path):
+    done = run("train.py", "--encoder", kind, "--distractors", "1", "--ranks", "1", "--frames", "200", "--out", str(tmp_path / "run"), *SMALL)
+    assert done.returncode == 0, done.stderr
+    done = run("evaluate.py", str(tmp_path / "run"), "--distractors", "0,1", "--episodes", "2")
+    assert done.returncode == 0, done.stderr
+    assert ("fixed input" in done.stdout) == (kind == "mlp")
+    assert len(evaluate.read(str(tmp_path / "run"), "zeroshot.csv")["episodes"]) == (1 if kind == "mlp" else 2)
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_stopped_and_resumed_equals_never_stopped(ranks, tmp_path):
+    """SIGTERM in the middle, then --resume: bit-equal weights and byte-equal progress.csv."""
+    command = ["train.py", "--distractors", "1", "--ranks", str(ranks), "--frames", "1600", *SMALL]
+    assert run(*command, "--out", str(tmp_path / "whole")).returncode == 0
+    process = subprocess.Popen([sys.executable, *command, "--out", str(tmp_path / "cut")], cwd=HERE, stdout=subprocess.PIPE, text=True)
+    for line in process.stdout:
+        if line.startswith("update 2/"):
+            process.send_signal(signal.SIGTERM)
+            break
+    assert "stopped after" in process.communicate(timeout=60)[0] and process.returncode == 0
+    assert run(*command, "--out", str(tmp_path / "cut"), "--resume").returncode == 0
+    whole, cut = (torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("whole", "cut"))
+    assert whole["update"] == cut["update"] == 8
+    assert all(torch.equal(value, cut["learner"][key]) for key, value in whole["learner"].items())
+    assert (tmp_path / "whole" / "progress.csv").read_bytes() == (tmp_path / "cut" / "progress.csv").read_bytes()
+
+
+def test_resume_drops_rows_after_the_checkpoint_and_torn_lines(tmp_path):
+    path = tmp_path / "rows.csv"
+    path.write_text("update,score\n1,0.1\n2,0.2\n3,0.3\n4,0.4\n5,")
+    train.keep_rows(str(path), ("update", "score"), 2)
+    assert path.read_text() == "update,score\n1,0.1\n2,0.2\n"
+    train.keep_rows(str(path), ("update", "score"), 0)
+    assert path.read_text() == "update,score\n"
+
+
+def test_torchrun_starts_the_same_file(tmp_path):
+    done = run("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "train.py", "--frames", "400", "--out", str(tmp_path / "run"), *SMALL)
+    assert done.returncode == 0, done.stderr
+    assert train.load(str(tmp_path / "run"))[0]["frames"] == 400
+
+
+def test_bad_command_lines_end_with_one_line_and_status_2(tmp_path, capsys, monkeypatch):
+    (tmp_path / "file").write_text("not a folder")
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "checkpoint.pt").write_text("not a checkpoint")
+    old = str(tmp_path / "old")
+    for command, words in ((["train.py", "--encoder", "gnn"], "--encoder"), (["train.py", "--distractors", "-1"], "distractors"),
+                           (["train.py", "--distractors", "99"], "distractors"), (["train.py", "--distractors", "two"], "--distractors"),
+                           (["train.py", "--frames", "0"], "--frames"), (["train.py", "--seed", "-1"], "--seed"),
+                           (["train.py", "--out", str(tmp_path / "file")], "--out"), (["train.py", "--out", old], "--overwrite"),
+                           (["train.py", "--out", old, "--resume"], "not a readable checkpoint"), (["train.py", "--set", "joy=1"], "joy"),
+                           (["train.py", "--set", "relations=maybe"], "relations"), (["train.py", "--ranks", "3"], "--ranks"),
+                           (["train.py", "--set", "minibatches=7"], "minibatches"), (["train.py", "--encoder", "attn", "--set", "heads=7"], "heads"),
+                           (["evaluate.py", old], "not a readable checkpoint"), (["evaluate.py", str(tmp_path / "none")], "not a readable checkpoint"),
+                           (["evaluate.py", old, "--distractors", "x"], "--distractors"), (["evaluate.py", old, "--episodes", "-1"], "--episodes")):
+        monkeypatch.setattr(sys, "argv", command)
+        with pytest.raises(SystemExit) as stop:
+            (train if command[0] == "train.py" else evaluate).main()
+        error = capsys.readouterr().err.splitlines()
+        assert stop.value.code == 2 and len(error) == 1 and words in error[0], (command, error)
+    assert (tmp_path / "old" / "checkpoint.pt").read_text() == "not a checkpoint"
+    done = run("train.py", "--encoder", "gnn")                 # and once as a user sees it
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["lrn.py", "rn.py", "attn.py", "ppo.py", "trifinger_env.py"])
+def test_module_works_alone_in_an_empty_folder(name, tmp_path):
+    shutil.copy(os.path.join(HERE, name), tmp_path)
+    done = run("-c", f"import {name[:-3]}", cwd=tmp_path)
+    assert done.returncode == 0 and not done.stdout, done      # importing prints nothing
+    done = run(name, cwd=tmp_path)
+    assert done.returncode == 0 and len(done.stdout.splitlines()) >= 3, done
+    assert sorted(os.listdir(tmp_path)) in ([name], ["__pycache__", name])
