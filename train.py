@@ -251,8 +251,11 @@ def train(args, settings):
     if rank == 0:
         print(f"{'finished' if update == total else 'stopped'} after {update} updates, {seconds / 60:.1f} minutes: {paths['checkpoint.pt']}")
     if ranks > 1:
-        dist.barrier()                                         # leave together: a rank that goes early can abort the others
+        dist.barrier()                                         # leave together: nobody waits for a rank that is gone
         dist.destroy_process_group()
+        sys.stdout.flush()
+        os._exit(0)                                            # python's own shutdown may meet gloo's threads and abort
+
 
 
 def start_rank(rank, ranks, port, *arguments):
