@@ -72,9 +72,15 @@ class PPO(nn.Module):
         self.register_buffer("return_mean", torch.zeros(()))
         self.register_buffer("return_square", torch.ones(()))
         self.register_buffer("return_batches", torch.zeros(()))
-        self.optimizer = torch.optim.Adam(agent.parameters(), lr=lr, eps=adam_eps)
-        for p in agent.parameters():                           # also where no loss reaches, so that ranks can average
-            p.grad = torch.zeros_like(p)
+        # Weights and gradients become views of one vector each: averaging, clipping and Adam are then a few operations in
+        # all instead of a few per layer, which on small networks costs as much as the matrix products.
+        parameters = list(agent.parameters())
+        self.weights = nn.utils.parameters_to_vector(parameters).detach()
+        self.weights.grad = torch.zeros_like(self.weights)
+        nn.utils.vector_to_parameters(self.weights, parameters)
+        for p, grad in zip(parameters, self.weights.grad.split([p.numel() for p in parameters])):
+            p.grad = grad.view_as(p)
+        self.optimizer = torch.optim.Adam([self.weights], lr=lr, eps=adam_eps)
         self.buffer = None
 
     def return_std(self):
@@ -169,18 +175,17 @@ class PPO(nn.Module):
         if self.normalize_advantages:
             std = (moments[3] - moments[2] ** 2).clamp(min=0).sqrt()
             batch["advantages"] = (batch["advantages"] - moments[2]) / (std + 1e-8)
-        parameters, names, total = list(self.agent.parameters()), list(self.buffer), {}
+        gradient, names, total = self.weights.grad, list(self.buffer), {}
         for _ in range(self.epochs):
             for rows in torch.randperm(len(batch["returns"])).chunk(self.minibatches):
                 part = {key: value[rows] for key, value in batch.items()}
                 loss, stats = self.loss({key: part.pop(key) for key in names}, **part, clip=clip)
-                self.optimizer.zero_grad(set_to_none=False)
-                loss.backward()
-                gradient = rank_mean(nn.utils.parameters_to_vector(p.grad for p in parameters))
-                nn.utils.vector_to_parameters(gradient, [p.grad for p in parameters])
-                stats["grad_norm"] = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
-                if not torch.isfinite(stats["grad_norm"]):
+                gradient.zero_()
+                loss.backward()                                # adds to `gradient` through the views
+                norm = stats["grad_norm"] = rank_mean(gradient).norm()
+                if not torch.isfinite(norm):
                     raise FloatingPointError(f"the gradient is not finite (loss {loss.item()})")
+                gradient *= (self.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
                 self.optimizer.step()
                 for key, value in stats.items():
                     total[key] = total.get(key, 0.0) + value.detach() / (self.epochs * self.minibatches)

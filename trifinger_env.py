@@ -29,6 +29,7 @@ CUBE_MASS = 0.08                         # kg
 FRICTION = {"cube": 1.0, "finger": 0.1, "floor": 0.5}          # Bullet multiplies the two in contact
 IDENTIFIERS = np.linspace(-1.0, 1.0, 21)                       # pool that covers every N, so none is new when N grows
 YAW = [-math.radians(90 + 120 * k) for k in range(3)]          # heading of finger k
+HEADING = [(math.sin(yaw), math.cos(yaw)) for yaw in YAW]
 
 # Table 1, with the divisor that brings each entry to about [-1, 1]; fixed numbers, so nothing here depends on N.
 CUBE_SCALE = [1] + [CUBE] * 3 + [0.2] * 3 + [1] * 4 + [0.5] * 3 + [10] * 3 + [1]    # type size pos quat v omega id
@@ -43,13 +44,13 @@ def forward_kinematics(k, q):
     x = -LINK * (math.sin(q[1]) + math.sin(q[1] + q[2])) - BASE
     w = -LINK * (math.cos(q[1]) + math.cos(q[1] + q[2]))       # depth below the upper joint, in the finger's plane
     y, z = -OFFSET * c0 + w * s0, OFFSET * s0 + w * c0
-    s, c = math.sin(YAW[k]), math.cos(YAW[k])
+    s, c = HEADING[k]
     return c * x - s * y, s * x + c * y, z + HEIGHT
 
 
 def inverse_kinematics(k, tip):
     """Joint angles (3,) in rad that bring finger k's tip to `tip` (3,) in m. ValueError if it is out of reach."""
-    s, c = math.sin(YAW[k]), math.cos(YAW[k])
+    s, c = HEADING[k]
     x, y, z = c * tip[0] + s * tip[1] + BASE, -s * tip[0] + c * tip[1], tip[2] - HEIGHT
     depth = y * y + z * z - OFFSET ** 2
     w = -math.sqrt(max(depth, 0.0))
@@ -59,6 +60,11 @@ def inverse_kinematics(k, tip):
     q0 = math.remainder(math.atan2(w, -OFFSET) - math.atan2(z, y), 2 * math.pi)
     q2 = -2 * math.acos(r / (2 * LINK))
     return q0, math.atan2(-x, -w) - q2 / 2, q2
+
+
+def clip(values, low, high):
+    """Values limited to [low, high] one by one; plain python, which on nine numbers beats numpy."""
+    return [a if v < a else b if v > b else v for v, a, b in zip(values, low, high)]
 
 
 def rotation(quaternion):
@@ -206,7 +212,7 @@ class TriFingerEnv:
         self.substeps, self.timestep, self.goal_yaw, self.render_mode = substeps, timestep, goal_yaw, render_mode
         self.reward_weights = {**REWARD_WEIGHTS, **(reward_weights or {})}
         self._rng, self._steps = np.random.default_rng(), None
-        self._scale = 1 / np.array(CUBE_SCALE * (self.distractors + 1) + FINGER_SCALE * 3 + GOAL_SCALE)
+        self._scale = 1 / np.array(CUBE_SCALE * (self.distractors + 1) + FINGER_SCALE * 3 + GOAL_SCALE, np.float32)
         self._client = pb.connect(pb.GUI if render_mode == "human" else pb.DIRECT)
         if render_mode == "human":
             pb.configureDebugVisualizer(pb.COV_ENABLE_GUI, 0, physicsClientId=self._client)
@@ -302,6 +308,7 @@ class TriFingerEnv:
         height = float(self._rng.uniform(CUBE / 2, 0.2)) if self.task == "lift" else CUBE / 2
         x, y, yaw = poses[0].tolist()
         self.goal = ((x, y, height), (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
+        self._goal_row = (1.0, CUBE, CUBE, CUBE, *self.goal[0], *self.goal[1], self._ids[self.target])
         order = list(range(2, count + 1))
         order.insert(self.target, 1)
         for cube, (x, y, yaw) in zip(self._cubes, poses[order]):
@@ -313,7 +320,7 @@ class TriFingerEnv:
         if self.render_mode:
             self._paint()
         observation = self._observe()
-        self._previous = self._distances()
+        self._distances = self._measure()
         return observation, {"fractional_success": self._rho}
 
     def step(self, action):
@@ -327,26 +334,27 @@ class TriFingerEnv:
             action = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError):
             action = np.array(np.nan)
-        if action.shape != (9,) or not np.isfinite(action).all():
+        if action.shape != (9,) or not all(map(math.isfinite, action.tolist())):
             raise ValueError(f"action must be nine finite numbers, shape (9,), got {action!r}")
-        action = np.clip(action, -1.0, 1.0).tolist()
+        action = clip(action.tolist(), (-1.0,) * 9, (1.0,) * 9)
         if self.action_mode == "delta":
             targets = [q + 0.3 * a for q, a in zip(self._q, action)]
         else:
             targets = [low + (high - low) * (a + 1) / 2 for a, low, high in zip(action, LOWER * 3, UPPER * 3)]
-        targets = [min(max(q, low), high) for q, low, high in zip(targets, LOWER * 3, UPPER * 3)]
-        pb.setJointMotorControlArray(self._robot, JOINTS, pb.POSITION_CONTROL, targetPositions=targets, forces=(TORQUE,) * 9,
-                                     physicsClientId=self._client)
+        c = self._client                                       # passed by place below: keywords cost time at each call
+        pb.setJointMotorControlArray(self._robot, JOINTS, pb.POSITION_CONTROL, targetPositions=clip(targets, LOWER * 3, UPPER * 3),
+                                     forces=(TORQUE,) * 9, physicsClientId=c)
         for _ in range(self.substeps):
-            pb.stepSimulation(physicsClientId=self._client)
+            pb.stepSimulation(c)
         self._steps += 1
         observation = self._observe()
-        position, to_goal, to_tips = self._distances()
-        before, self._previous, rho, w = self._previous, (position, to_goal, to_tips), self._rho, self.reward_weights
+        last, last_to_goal, last_to_tips = self._distances
+        position, to_goal, to_tips = self._distances = self._measure()
+        rho, w = self._rho, self.reward_weights
         rewards = {"overlap": w["overlap"] * rho,
-                   "distance": w["distance"] * (before[1] - to_goal),
-                   "curiosity": w["curiosity"] * (1 - rho) ** 0.05 * math.log(math.dist(position, before[0]) + 1e-5),
-                   "reach": w["reach"] * (before[2] - to_tips)}
+                   "distance": w["distance"] * (last_to_goal - to_goal),
+                   "curiosity": w["curiosity"] * (1 - rho) ** 0.05 * math.log(math.dist(position, last) + 1e-5),
+                   "reach": w["reach"] * (last_to_tips - to_tips)}
         info = {"fractional_success": rho, "rewards": rewards}
         reason = self._trouble() or ("time" if self._steps >= self.episode_steps else None)
         if reason:
@@ -357,34 +365,31 @@ class TriFingerEnv:
 
     def _observe(self):
         """Read the simulator: joints, cube poses, rho. Returns the observation of Table 1, scaled, in fresh arrays."""
-        c, count = self._client, self.distractors + 1
-        self._poses, flat = [], []
+        c, split, flat, self._poses = self._client, 18 * len(self._cubes), [], []
         for cube, identifier in zip(self._cubes, self._ids):
-            position, turn = pb.getBasePositionAndOrientation(cube, physicsClientId=c)
-            linear, angular = pb.getBaseVelocity(cube, physicsClientId=c)
-            self._poses.append((position, turn))
+            position, turn = pose = pb.getBasePositionAndOrientation(cube, c)
+            linear, angular = pb.getBaseVelocity(cube, c)
+            self._poses.append(pose)
             if turn[3] < 0:                                    # q and -q are the same turn: show one of them
                 turn = (-turn[0], -turn[1], -turn[2], -turn[3])
             flat += (1.0, CUBE, CUBE, CUBE, *position, *turn, *linear, *angular, identifier)
-        joints = pb.getJointStates(self._robot, JOINTS, physicsClientId=c)
-        q, dq = self._q, self._dq = [j[0] for j in joints], [j[1] for j in joints]
-        self._tips = [forward_kinematics(k, q[3 * k:3 * k + 3]) for k in range(3)]
-        for k in range(3):
-            flat += (*q[3 * k:3 * k + 3], *dq[3 * k:3 * k + 3], k - 1.0, *self._tips[k])
-        flat += (1.0, CUBE, CUBE, CUBE, *self.goal[0], *self.goal[1], self._ids[self.target])
-        flat = (np.array(flat) * self._scale).astype(np.float32)
+        q, dq, _, _ = zip(*pb.getJointStates(self._robot, JOINTS, c))
+        self._q, self._dq = q, dq
+        self._tips = a, b, d = [forward_kinematics(k, q[3 * k:3 * k + 3]) for k in range(3)]
+        flat += (*q[:3], *dq[:3], -1.0, *a, *q[3:6], *dq[3:6], 0.0, *b, *q[6:], *dq[6:], 1.0, *d, *self._goal_row)
+        flat = np.array(flat, np.float32) * self._scale
         self._rho = aabb_overlap(self._poses[self.target], self.goal)
-        return {"cubes": flat[:18 * count].reshape(count, 18), "fingers": flat[18 * count:-12].reshape(3, 10), "goal": flat[-12:]}
+        return {"cubes": flat[:split].reshape(-1, 18), "fingers": flat[split:-12].reshape(3, 10), "goal": flat[-12:]}
 
-    def _distances(self):
+    def _measure(self):
         """Target cube's position, its distance to the goal, and the Frobenius norm of (fingertips - cube); all in m."""
-        position = self._poses[self.target][0]
+        position, (a, b, c) = self._poses[self.target][0], self._tips
         return (position, math.dist(position, self.goal[0]),
-                math.sqrt(sum((a - b) ** 2 for tip in self._tips for a, b in zip(tip, position))))
+                math.hypot(math.dist(a, position), math.dist(b, position), math.dist(c, position)))
 
     def _trouble(self):
         """Reason to cut the episode short, or None. Comparisons are written so that NaN fails them."""
-        if not all(abs(speed) < 200 for speed in self._dq):
+        if not sum(map(abs, self._dq)) < 1000:                 # rad/s; full speed of all joints is about 80
             return "the physics diverged"
         for (x, y, z), _ in self._poses:
             if not (x * x + y * y < (WALL + 0.03) ** 2 and -0.03 < z < 1.0):
@@ -423,29 +428,38 @@ class TriFingerEnv:
             self._client = None
 
 
-def speed_table(frames=2000):
-    """Frames/s by N under random actions, and how many times the bare physics a step and a reset take."""
-    print("   N  frames/s  step/physics  reset/step")
-    for distractors in (0, 2, 5, 9):
-        env, rng = TriFingerEnv(distractors=distractors), np.random.default_rng(0)
-        physics, spent, resets, bare = [], [], [], pb.stepSimulation
+def speed_table(episodes=21, steps=100):
+    """Frames/s under random actions, times the bare physics that a step takes and times a step that a reset takes.
 
-        def timed(**c):
-            start = time.perf_counter()
-            bare(**c)
-            physics.append(time.perf_counter() - start)
-        pb.stepSimulation = timed
-        for t in range(frames):
-            start = time.perf_counter()
-            if t % 100 == 0:
-                env.reset(seed=0 if t == 0 else None)
-                resets.append(time.perf_counter() - start)
-                start = time.perf_counter()
-            env.step(rng.uniform(-1, 1, 9))
-            spent.append(time.perf_counter() - start)
-        pb.stepSimulation = bare
-        env.close()
-        print(f"{distractors:4d} {frames / sum(spent):9.0f} {sum(spent) / sum(physics):13.2f} {np.mean(resets) / np.mean(spent):11.1f}")
+    Medians over episodes. The bare physics is timed inside the very same steps, by wrapping stepSimulation.
+    """
+    bare, clock, physics = pb.stepSimulation, time.perf_counter, []
+
+    def timed(client):
+        start = clock()
+        bare(client)
+        physics.append(clock() - start)
+
+    pb.stepSimulation, rng = timed, np.random.default_rng(0)
+    print("   N  control        frames/s  step/physics  reset/step")
+    for substeps, timestep in ((5, 0.008), (3, 0.004)):
+        for distractors in (0, 2, 5, 9):
+            env, rows = TriFingerEnv(distractors=distractors, substeps=substeps, timestep=timestep), []
+            env.reset(seed=0)
+            for actions in rng.uniform(-1, 1, (episodes, steps, 9)):
+                start = clock()
+                env.reset()
+                reset, spent = clock() - start, 0.0
+                physics.clear()
+                for action in actions:
+                    start = clock()
+                    env.step(action)
+                    spent += clock() - start
+                rows.append((steps / spent, spent / sum(physics), reset / spent * steps))
+            env.close()
+            rate, share, reset = np.median(rows, 0)
+            print(f"{distractors:4d}  {substeps} x {1000 * timestep:.0f} ms {rate:13.0f} {share:13.2f} {reset:11.1f}")
+    pb.stepSimulation = bare
 
 
 if __name__ == "__main__":
