@@ -192,6 +192,49 @@ def test_friction_of_a_cube_on_the_floor(env):
         assert (moved > 0.01) == slides, moved
 
 
+def test_long_physics_steps_keep_what_matters():
+    """8 ms steps: cubes rest without jitter, fingers at full speed (2 m/s) do not pass through cubes, a slow push carries."""
+    env = TriFingerEnv(substeps=1, episode_steps=10 ** 6)
+    c = {"physicsClientId": env._client}
+    env.reset(seed=0)
+    for _ in range(250):
+        pb.stepSimulation(**c)
+    for cube in env._cubes:
+        assert np.abs(pb.getBaseVelocity(cube, **c)).max() < 1e-3
+        assert abs(pb.getBasePositionAndOrientation(cube, **c)[0][2] - tri.CUBE / 2) < 1e-4
+    deepest, touched = 0.0, 0
+    for seed in range(6):
+        env.reset(seed=seed)
+        rng = np.random.default_rng(seed)
+        for t in range(500):
+            bang = np.sign(rng.uniform(-1, 1, 9)) if t % 25 == 0 else bang
+            env.step(bang)
+            touched += any(pb.getContactPoints(env._robot, cube, **c) for cube in env._cubes)
+            for position, quaternion in env._poses:
+                inside = tri.CUBE / 2 - np.abs(np.subtract(env._tips, position) @ tri.rotation(quaternion)).max(1)
+                deepest = max(deepest, inside.max())
+    assert touched > 50 and deepest < 0.005, (touched, deepest)                # the tip's centre; a cube is 65 mm wide
+    moved = []
+    for timestep in (0.008, 0.002):
+        env.timestep = timestep
+        env.reset(seed=0)
+        joints = [0.0, 1.4, -1.0] * 3                          # fingers 1 and 2 lifted out of the way
+        cube, start, heading = env._cubes[env.target], np.array([-0.065, 0.01, 0.035]), np.array([1.0, 0.0, 0.0])
+        for body in env._cubes:
+            away = [0.0, 0.0, tri.CUBE / 2] if body == cube else [0.1, 0.15 - 0.3 * (body % 2), tri.CUBE / 2]
+            pb.resetBasePositionAndOrientation(body, away, [0, 0, 0, 1], **c)
+        joints[:3] = tri.inverse_kinematics(0, start)
+        for j in range(9):
+            pb.resetJointState(env._robot, j, joints[j], 0.0, **c)
+        for t in range(round(1 / timestep)):
+            joints[:3] = tri.inverse_kinematics(0, start + 0.1 * t * timestep * heading)
+            pb.setJointMotorControlArray(env._robot, range(9), pb.POSITION_CONTROL, targetPositions=joints, forces=[tri.TORQUE] * 9, **c)
+            pb.stepSimulation(**c)
+        moved.append(np.array(pb.getBasePositionAndOrientation(cube, **c)[0]))
+    env.close()
+    assert moved[1][0] > 0.04 and np.linalg.norm(moved[0] - moved[1]) < 0.015, moved
+
+
 def turn(axis, angle):
     return tuple(math.sin(angle / 2) * np.array(axis, float)) + (math.cos(angle / 2),)
 
@@ -492,8 +535,31 @@ def test_ppo_refuses_a_batch_that_does_not_divide_and_a_loss_that_is_not_finite(
     assert all(torch.equal(p, q) for p, q in zip(before, learner.agent.parameters()))
 
 
+def test_update_on_one_vector_of_weights_equals_torch_layer_by_layer():
+    """Three steps of update() against torch's own gradient clipping and Adam over the list of parameters."""
+    torch.manual_seed(0)
+    learner = PPO(TinyAgent(), [PointOnLine() for _ in range(4)], steps=8, epochs=3, minibatches=1, lr=1e-2, max_grad_norm=0.2)
+    learner.agent.load_state_dict(learner.agent.state_dict())                  # loading must keep the weights in the vector
+    reference = TinyAgent()
+    reference.load_state_dict(learner.agent.state_dict())
+    learner.rollout([0, 1, 2, 3])
+    learner.update(1.0)
+    part = {key: value.flatten(0, 1) for key, value in learner.batch.items()}
+    part["returns"] = (part["returns"] - learner.return_mean) / learner.return_std()
+    part["advantages"] = (part["advantages"] - part["advantages"].mean()) / (part["advantages"].std(correction=0) + 1e-8)
+    optimizer, loss_of, norms = torch.optim.Adam(reference.parameters(), lr=1e-2, eps=1e-5), PPO(reference, [None], minibatches=1).loss, []
+    for _ in range(3):
+        optimizer.zero_grad()
+        loss_of({"x": learner.buffer["x"].flatten(0, 1)}, **part, clip=0.2)[0].backward()
+        norms.append(nn.utils.clip_grad_norm_(reference.parameters(), 0.2))
+        optimizer.step()
+    assert max(norms) > 0.2                                                    # so that clipping is part of the comparison
+    for ours, torchs in zip(learner.agent.parameters(), reference.parameters()):
+        torch.testing.assert_close(ours, torchs, atol=1e-5, rtol=1e-4)
+
+
 TWO_RANKS = """
-import sys, torch, torch.distributed as dist
+import os, sys, torch, torch.distributed as dist
 sys.path.insert(0, {here!r})
 from ppo import PPO, PointOnLine, TinyAgent
 
@@ -517,6 +583,7 @@ def rank(r, path):
     want = torch.cat([p.grad.flatten() for p in both.agent.parameters()])
     assert torch.allclose(got, want, rtol=1e-4, atol=1e-6), (got - want).abs().max()
     assert want.abs().max() > 1e-3
+    os._exit(0)                                              # see the end of train.train()
 
 if __name__ == "__main__":
     torch.multiprocessing.spawn(rank, ({store!r},), 2)
