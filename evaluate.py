@@ -2,7 +2,7 @@
 
     python evaluate.py RUN [RUN ...] --distractors 0-9 --episodes 200      table, and zeroshot.csv in each run folder
     python evaluate.py RUN --mean-actions                                  without sampling noise: zeroshot-mean.csv
-    python evaluate.py RUN [RUN ...] --episodes 0 --plot curves.png        training and zero-shot curves from the CSV files
+    python evaluate.py RUN [RUN ...] --episodes 0 --plot curves.png        README's table and curves, from the CSV files alone
     python evaluate.py RUN --distractors 9 --episodes 0 --gif push.gif     a film of one episode
 
 Episode j starts from the same seed at every N and for every agent: the goal and the target cube stand in the same places,
@@ -12,13 +12,16 @@ import argparse
 import csv
 import multiprocessing
 import os
+import re
 
 import numpy as np
 import torch
 
 from train import fail, load, make_env
+from trifinger_env import CUBE
 
-COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict", "solved", "cut_short")
+COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict", "solved", "cut_short",
+           "blocked", "success_clear", "success_blocked", "z_drift")
 CHUNK = 25                                # episodes played side by side; fixed, so that results do not depend on the cores
 
 
@@ -27,23 +30,50 @@ def episode_seed(episode):
     return int(np.random.SeedSequence((20220131, episode)).generate_state(1)[0])
 
 
+def is_blocked(obs):
+    """Does a distractor's centre lie within a cube's width of the straight line from the target to the goal?"""
+    here, goal = obs["cubes"][:, 4:6] * 0.2, obs["goal"][4:6] * 0.2            # m, see CUBE_SCALE
+    target = obs["cubes"][:, -1] == obs["goal"][-1]
+    start, others = here[target][0], here[~target]                             # (2,), (N, 2)
+    share = np.clip((others - start) @ (goal - start) / max(np.square(goal - start).sum(), 1e-12), 0, 1)
+    return bool((np.linalg.norm(others - start - share[:, None] * (goal - start), axis=1) < CUBE).any())
+
+
 @torch.inference_mode()
 def play(path, distractors, first, count, mean_actions):
-    """Play episodes first .. first+count-1 of the agent in `path`. Returns a list of (rho, strict rho, was cut short)."""
+    """Play episodes first .. first+count-1 of the agent in `path`. Returns a row of five numbers for each:
+
+    rho, strict rho, was it cut short, was the way to the goal blocked at the start, and the drift of z: how far the first
+    z lies from the z of the same episode at the training N, over the mean distance between different episodes there.
+    """
     torch.set_num_threads(1)
     checkpoint, agent = load(path)
-    envs = [make_env(checkpoint["task"], distractors, checkpoint["settings"]) for _ in range(count)]
+
+    def batch(observations):
+        return {key: torch.from_numpy(np.stack([obs[key] for obs in observations])) for key in observations[0]}
+
+    def start(n):
+        envs = [make_env(checkpoint["task"], n, checkpoint["settings"]) for _ in range(count)]
+        return envs, [env.reset(seed=episode_seed(first + e))[0] for e, env in enumerate(envs)]
+
+    trained, there = start(checkpoint["distractors"])
+    for env in trained:
+        env.close()
+    envs, observations = start(distractors)
+    z, z_there = agent.encode(batch(observations)), agent.encode(batch(there))                 # (B, Z)
+    drift = (z - z_there).norm(dim=1) / (torch.cdist(z_there, z_there).sum() / max(count * (count - 1), 1))
+    blocked, results = [is_blocked(obs) for obs in observations], [None] * count
     noise = [np.random.default_rng(episode_seed(first + e)) for e in range(count)]
-    observations, results = [env.reset(seed=episode_seed(first + e))[0] for e, env in enumerate(envs)], [None] * count
     while None in results:
-        mean, log_std, _ = agent({key: torch.from_numpy(np.stack([obs[key] for obs in observations])) for key in observations[0]})
+        mean, log_std, _ = agent(batch(observations))
         mean, std = mean.numpy(), log_std.exp().numpy()
         for e, env in enumerate(envs):
             if results[e] is None:
                 action = mean[e] if mean_actions else mean[e] + std * noise[e].standard_normal(9)
                 observations[e], _, _, truncated, info = env.step(action)
                 if truncated:
-                    results[e] = info["fractional_success"], info["fractional_success_strict"], info["truncated_by"] != "time"
+                    results[e] = (info["fractional_success"], info["fractional_success_strict"], info["truncated_by"] != "time",
+                                  blocked[e], drift[e].item())
     for env in envs:
         env.close()
     return results
@@ -51,10 +81,12 @@ def play(path, distractors, first, count, mean_actions):
 
 def summary(distractors, results):
     """One row of zeroshot.csv; ci95 is the half width of the normal 95 % interval of the mean over episodes."""
-    values = np.array(results, float)                                          # (episodes, 3)
-    half = 1.96 * values.std(0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.full(3, np.nan)
-    mean = values.mean(0)
-    return dict(zip(COLUMNS, (distractors, len(values), mean[0], mean[1], half[0], half[1], (values[:, 0] >= 0.8).mean(), int(values[:, 2].sum()))))
+    values = np.array(results, float)                                          # (episodes, 5)
+    half = 1.96 * values.std(0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.full(5, np.nan)
+    mean, rho, blocked = values.mean(0), values[:, 0], values[:, 3] > 0
+    clear, behind = (rho[rows].mean() if rows.any() else np.nan for rows in (~blocked, blocked))
+    return dict(zip(COLUMNS, (distractors, len(values), mean[0], mean[1], half[0], half[1], (rho >= 0.8).mean(), int(values[:, 2].sum()),
+                              mean[3], clear, behind, mean[4])))
 
 
 def evaluate(run, distractors, episodes, mean_actions=False):
@@ -66,14 +98,15 @@ def evaluate(run, distractors, episodes, mean_actions=False):
     chunks = [(n, first, min(CHUNK, episodes - first)) for n in distractors for first in range(0, episodes, CHUNK)]
     print(f"{run}: {checkpoint['encoder']} trained on {checkpoint['task']} with {checkpoint['distractors']} distractors, "
           f"{checkpoint['frames']} frames, {'mean' if mean_actions else 'sampled'} actions")
-    print("   N  episodes  success (axis-aligned)  success (strict)  solved  cut short")
+    print("   N  episodes  success (axis-aligned)  success (strict)  solved  cut short   way clear  way blocked (share)   drift of z")
     with multiprocessing.get_context("spawn").Pool(min(os.cpu_count(), len(chunks) or 1)) as pool:
         parts = pool.starmap(play, [(run, *chunk, mean_actions) for chunk in chunks], chunksize=1)
     rows = []
     for n in distractors:
         rows.append(summary(n, [r for chunk, part in zip(chunks, parts) if chunk[0] == n for r in part]))
         print("{distractors:4d} {episodes:9d}        {success_aabb:.3f} +- {ci95:.3f}    {success_strict:.3f} +- {ci95_strict:.3f}   "
-              "{solved:.3f} {cut_short:10d}".format(**rows[-1]), flush=True)
+              "{solved:.3f} {cut_short:10d}       {success_clear:.3f}        {success_blocked:.3f} ({blocked:.2f})        {z_drift:.3f}"
+              .format(**rows[-1]), flush=True)
     if rows and os.path.isdir(run):
         path = os.path.join(run, "zeroshot-mean.csv" if mean_actions else "zeroshot.csv")
         lines = {row["distractors"]: [str(row[key]) if isinstance(row[key], int) else f"{row[key]:.4f}" for key in COLUMNS] for row in rows}
@@ -96,6 +129,50 @@ def read(run, name):
         raise ValueError(f"{path} is missing or not a CSV of this project") from None
 
 
+def by_seed(runs):
+    """Runs that differ only in the seed, together: {"push-lrn-n2": [folder, ...]}."""
+    groups = {}
+    for run in runs:
+        groups.setdefault(re.sub(r"-seed\d+$", "", os.path.basename(os.path.normpath(run))), []).append(run)
+    return groups
+
+
+def over_seeds(runs, key):
+    """{N: (mean, half width)} of a column of the runs' zeroshot.csv: a 95 % interval over the episodes of one run, or,
+    with several, over the seeds (Student's t, which is wide for few)."""
+    cells, result = {}, {}
+    for run in runs:
+        rows = read(run, "zeroshot.csv")
+        for i, n in enumerate(rows["distractors"]):
+            share = rows["solved"][i]
+            half = {"success_aabb": rows["ci95"][i], "success_strict": rows["ci95_strict"][i],
+                    "solved": 1.96 * np.sqrt(share * (1 - share) / rows["episodes"][i])}[key]
+            cells.setdefault(int(n), []).append((rows[key][i], half))
+    for n in sorted(cells):
+        values, half = np.array([value for value, _ in cells[n]]), cells[n][0][1]
+        if len(values) > 1:
+            half = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776}.get(len(values), 2.5) * values.std(ddof=1) / np.sqrt(len(values))
+        result[n] = values.mean(), half
+    return result
+
+
+def table(runs):
+    """Print README's table of the runs that have been evaluated."""
+    groups = {name: members for name, members in by_seed(runs).items()
+              if all(os.path.exists(os.path.join(run, "zeroshot.csv")) for run in members)}
+    columns = {(name, key): over_seeds(members, key) for name, members in groups.items() for key in ("success_aabb", "success_strict", "solved")}
+    numbers = sorted({n for cells in columns.values() for n in cells})
+    if not numbers:
+        return print("no zeroshot.csv in these runs yet: evaluate them with --episodes 200 first")
+    print("| agent | seeds | million frames | minutes | measure | " + " | ".join(f"N = {n}" for n in numbers) + " |")
+    print("|---" * (5 + len(numbers)) + "|")
+    for (name, key), cells in columns.items():
+        frames, seconds = ([read(run, "timing.csv")[column][-1] for run in groups[name]] for column in ("frames", "seconds"))
+        print(f"| {name} | {len(groups[name])} | {np.mean(frames) / 1e6:.1f} | {np.mean(seconds) / 60:.0f} | "
+              f"{dict(success_aabb='axis-aligned', success_strict='strict', solved='solved')[key]} | "
+              + " | ".join(f"{cells[n][0]:.2f} ± {cells[n][1]:.2f}" if n in cells else "-" for n in numbers) + " |")
+
+
 def plot(runs, path):
     """Training curves (left) and zero-shot curves (right, with 95 % intervals) of the runs, as in figure 3."""
     try:
@@ -105,17 +182,20 @@ def plot(runs, path):
     matplotlib.use("Agg")
     from matplotlib import pyplot
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for run in runs:
-        label, progress = os.path.basename(os.path.normpath(run)), read(run, "progress.csv")
-        window = min(20, len(progress["frames"]))
+    for name, members in by_seed(runs).items():
+        progress = [read(run, "progress.csv") for run in members]
+        count = min(len(rows["frames"]) for rows in progress)
+        window, color = min(20, count), None
+        frames = progress[0]["frames"][window - 1:count] / 1e6
         for key, style in (("success_aabb", "-"), ("success_strict", ":")):
-            smooth = np.convolve(progress[key], np.ones(window) / window, "valid")
-            line, = left.plot(progress["frames"][window - 1:] / 1e6, smooth, style, label=label if style == "-" else None,
-                              color=None if style == "-" else line.get_color())
-        if os.path.exists(os.path.join(run, "zeroshot.csv")):
-            rows = read(run, "zeroshot.csv")
-            right.errorbar(rows["distractors"], rows["success_aabb"], rows["ci95"], marker="o", capsize=3, color=line.get_color(), label=label)
-            right.plot(rows["distractors"], rows["success_strict"], ":", color=line.get_color())
+            smooth = [np.convolve(rows[key][:count], np.ones(window) / window, "valid") for rows in progress]
+            line, = left.plot(frames, np.mean(smooth, 0), style, label=name if style == "-" else None, color=color)
+            color = line.get_color()
+            left.fill_between(frames, np.min(smooth, 0), np.max(smooth, 0), color=color, alpha=0.15, linewidth=0)
+            if all(os.path.exists(os.path.join(run, "zeroshot.csv")) for run in members):
+                cells = over_seeds(members, key)
+                right.errorbar(list(cells), *zip(*cells.values()), linestyle=style, marker="o", markersize=3, capsize=3, color=color,
+                               label=name if style == "-" else None)
     left.set(xlabel="million frames", ylabel="fractional success, last step", title=f"training (mean of {window} updates)")
     right.set(xlabel="distractors at test time", title="zero-shot (solid: axis-aligned, dotted: strict)")
     for axes in (left, right):
@@ -167,7 +247,7 @@ def main():
     parser.error = fail
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder of train.py")
     parser.add_argument("--distractors", default="0-9", metavar="LIST", help="numbers of distractors, as 0-9 or 0,2,14 (default 0-9)")
-    parser.add_argument("--episodes", type=int, default=200, metavar="E", help="episodes at each N; 0: do not play (default 200)")
+    parser.add_argument("--episodes", type=int, default=200, metavar="E", help="episodes at each N; 0: show what was measured before (default 200)")
     parser.add_argument("--mean-actions", action="store_true", help="play the mean of the policy instead of sampling")
     parser.add_argument("--plot", metavar="FILE", help="draw training and zero-shot curves of all runs from their CSV files")
     parser.add_argument("--gif", metavar="FILE", help="film an episode of the first run at the first N")
@@ -181,6 +261,8 @@ def main():
             make_env(checkpoint["task"], numbers[-1], checkpoint["settings"]).close()      # refuses an N that is too large
         for run in args.runs if args.episodes else ():
             evaluate(run, numbers, args.episodes, args.mean_actions)
+        if not args.episodes:
+            table(args.runs)
         if args.plot:
             plot(args.runs, args.plot)
         if args.gif:

@@ -648,6 +648,31 @@ def test_checkpoint_evaluates_at_other_numbers_of_distractors(trained):
     assert np.mean([result[0] for result in first[0]]) == pytest.approx(first[1]["success_aabb"])
 
 
+def test_blocked_ways_and_the_drift_of_z(trained):
+    obs = {"cubes": np.zeros((3, 18), np.float32), "goal": np.zeros(12, np.float32)}
+    obs["cubes"][:, -1], obs["goal"][-1] = (-0.5, 0.0, 0.5), 0.5
+    obs["cubes"][2, 4:6], obs["goal"][4:6] = np.divide([-0.1, 0.0], 0.2), np.divide([0.1, 0.0], 0.2)       # target and goal, m / 0.2
+    for x, y, blocks in ((0.0, 0.06, True), (0.0, 0.07, False), (0.16, 0.0, True), (0.17, 0.0, False), (-0.14, 0.04, True), (-0.15, 0.05, False)):
+        obs["cubes"][0, 4:6], obs["cubes"][1, 4:6] = np.divide([x, y], 0.2), np.divide([0.0, -0.2], 0.2)
+        assert evaluate.is_blocked(obs) == blocks, (x, y)
+    same, other = (np.array(evaluate.play(trained, n, 0, 4, False), float) for n in (0, 3))        # trained with 0 distractors
+    assert (same[:, 4] == 0).all() and (other[:, 4] > 0.01).all() and (same[:, 3] == 0).all()
+
+
+def test_table_puts_seeds_together(tmp_path, capsys):
+    rows = {"push-lrn-n2-seed0": 0.9, "push-lrn-n2-seed1": 0.7, "push-lrn-n2-seed2": 0.8, "push-mlp-n2-seed0": 0.5}
+    for name, score in rows.items():
+        os.mkdir(tmp_path / name)
+        line = dict.fromkeys(evaluate.COLUMNS, 0.0) | {"distractors": 2, "episodes": 100, "success_aabb": score, "ci95": 0.03, "solved": score}
+        (tmp_path / name / "zeroshot.csv").write_text(",".join(line) + "\n" + ",".join(map(str, line.values())) + "\n")
+        (tmp_path / name / "timing.csv").write_text("frames,seconds\n6000000,1800\n")
+    evaluate.table([str(tmp_path / name) for name in rows])
+    text = capsys.readouterr().out
+    assert "| push-lrn-n2 | 3 | 6.0 | 30 | axis-aligned | 0.80 ± 0.25 |" in text       # 4.303 * 0.1 / sqrt(3), t with 2 degrees of freedom
+    assert "| push-mlp-n2 | 1 | 6.0 | 30 | axis-aligned | 0.50 ± 0.03 |" in text
+    assert "| push-mlp-n2 | 1 | 6.0 | 30 | solved | 0.50 ± 0.10 |" in text             # 1.96 * sqrt(0.5 * 0.5 / 100)
+
+
 def test_plot_and_film(trained, tmp_path):
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (optional)")
     done = run("evaluate.py", trained, "--episodes", "0", "--distractors", "1", "--plot", str(tmp_path / "a.png"), "--gif", str(tmp_path / "a.gif"))
@@ -698,27 +723,100 @@ def test_torchrun_starts_the_same_file(tmp_path):
     assert train.load(str(tmp_path / "run"))[0]["frames"] == 400
 
 
-def test_bad_command_lines_end_with_one_line_and_status_2(tmp_path, capsys, monkeypatch):
-    (tmp_path / "file").write_text("not a folder")
-    (tmp_path / "old").mkdir()
-    (tmp_path / "old" / "checkpoint.pt").write_text("not a checkpoint")
-    old = str(tmp_path / "old")
-    for command, words in ((["train.py", "--encoder", "gnn"], "--encoder"), (["train.py", "--distractors", "-1"], "distractors"),
-                           (["train.py", "--distractors", "99"], "distractors"), (["train.py", "--distractors", "two"], "--distractors"),
-                           (["train.py", "--frames", "0"], "--frames"), (["train.py", "--seed", "-1"], "--seed"),
-                           (["train.py", "--out", str(tmp_path / "file")], "--out"), (["train.py", "--out", old], "--overwrite"),
-                           (["train.py", "--out", old, "--resume"], "not a readable checkpoint"), (["train.py", "--set", "joy=1"], "joy"),
-                           (["train.py", "--set", "relations=maybe"], "relations"), (["train.py", "--ranks", "3"], "--ranks"),
-                           (["train.py", "--set", "minibatches=7"], "minibatches"), (["train.py", "--encoder", "attn", "--set", "heads=7"], "heads"),
-                           (["evaluate.py", old], "not a readable checkpoint"), (["evaluate.py", str(tmp_path / "none")], "not a readable checkpoint"),
-                           (["evaluate.py", old, "--distractors", "x"], "--distractors"), (["evaluate.py", old, "--episodes", "-1"], "--episodes")):
-        monkeypatch.setattr(sys, "argv", command)
+def test_a_killed_rank_ends_the_run_with_a_message_and_leaves_nobody_behind(tmp_path):
+    command = [sys.executable, "train.py", "--ranks", "2", "--out", str(tmp_path / "run"), *SMALL]
+    process = subprocess.Popen(command, cwd=HERE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    for line in process.stdout:
+        if line.startswith("update 2/"):
+            break
+    children = [int(p) for p in os.listdir("/proc") if p.isdigit() and f"PPid:\t{process.pid}\n" in open(f"/proc/{p}/status").read()]
+    rank = [p for p in children if b"spawn_main" in open(f"/proc/{p}/cmdline", "rb").read()]
+    assert len(rank) == 1
+    os.kill(rank[0], signal.SIGKILL)
+    error = process.communicate(timeout=60)[1]
+    assert process.returncode == 1 and "SIGKILL" in error and "--resume" in error, error
+    assert not any(os.path.exists(f"/proc/{p}") for p in children)
+
+
+def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_checkpoint(tmp_path, capsys, monkeypatch):
+    out = str(tmp_path / "run")
+    monkeypatch.setattr(sys, "argv", ["train.py", "--ranks", "1", "--frames", "400", "--distractors", "0", "--out", out, *SMALL])
+    train.main()
+    before = open(os.path.join(out, "checkpoint.pt"), "rb").read()
+    checkpoint = torch.load(os.path.join(out, "checkpoint.pt"), weights_only=True)
+    checkpoint["settings"]["frames"] = 800
+    train.save(checkpoint, os.path.join(out, "checkpoint.pt"))
+    monkeypatch.setattr(sys, "argv", ["train.py", "--distractors", "0", "--out", out, "--resume"])
+    monkeypatch.setattr(train.Agent, "auxiliary", lambda self, obs: self.log_std.sum() * float("nan"))
+    changed = open(os.path.join(out, "checkpoint.pt"), "rb").read()
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        train.main()
+    assert stop.value.code == 1 and "update 3" in capsys.readouterr().err
+    assert before != changed == open(os.path.join(out, "checkpoint.pt"), "rb").read()
+
+
+class Evil:
+    def __reduce__(self):
+        return os.mkdir, ("evil",)
+
+
+@pytest.fixture
+def bad(tmp_path, trained, monkeypatch):
+    """Folder with a good run and every kind of broken one; also the working directory."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(trained, "good")
+    good = torch.load(os.path.join("good", "checkpoint.pt"), weights_only=True)
+    nan = {**good, "learner": {key: value * float("nan") for key, value in good["learner"].items()}}
+    for name, content in (("list", [1, 2]), ("nan", nan), ("other-z", {**good, "settings": {**good["settings"], "z_dim": 7}}),
+                          ("swapped", {**good, "encoder": "attn"}), ("stranger", {"weights": good["learner"]}), ("code", Evil()),
+                          ("old", {**good, "settings": {key: good["settings"][key] for key in list(good["settings"])[:5]}})):
+        os.mkdir(name)
+        torch.save(content, os.path.join(name, "checkpoint.pt"))
+    for name, content in (("half", open(os.path.join("good", "checkpoint.pt"), "rb").read()[:5000]), ("empty", b""), ("text", b"no")):
+        os.mkdir(name)
+        with open(os.path.join(name, "checkpoint.pt"), "wb") as file:
+            file.write(content)
+    os.mkdir("rows")
+    shutil.copy(os.path.join("good", "progress.csv"), "rows")
+    with open("file", "w") as file:
+        file.write("not a folder")
+
+
+def test_bad_input_ends_with_one_line_and_status_2(bad, capsys, monkeypatch):
+    """Each line names the flag or the file; nothing is written over, no traceback."""
+    fresh, resume, play, kept = "train.py --out new ", "train.py --resume --distractors 0 --out ", "evaluate.py --episodes 2 --distractors 0 ", {}
+    cases = [(fresh + flags, words) for flags, words in (
+        ("--encoder gnn", "--encoder"), ("--task fly", "--task"), ("--distractors -1", "distractors"), ("--distractors 99", "distractors"),
+        ("--distractors 1.5", "--distractors"), ("--distractors two", "--distractors"), ("--frames 0", "--frames"), ("--frames -5", "--frames"),
+        ("--frames many", "--frames"), ("--seed -1", "--seed"), ("--seed x", "--seed"), ("--ranks 0", "--ranks"), ("--ranks 3", "--ranks"),
+        ("--save-minutes soon", "--save-minutes"), ("--set joy=1", "joy"), ("--set z_dim", "z_dim"), ("--set z_dim=0", "z_dim"),
+        ("--set z_dim=2.5", "z_dim"), ("--set relations=maybe", "relations"), ("--set lr=-1", "lr"), ("--set lr=nan", "lr"),
+        ("--set log_std=inf", "log_std"), ("--set minibatches=7", "minibatches"), ("--set action_mode=torque", "action_mode"),
+        ("--encoder attn --set heads=7", "heads"), ("--speed 3", "--speed"), ("--resume", "new"), ("--resume --overwrite", "--overwrite"))]
+    cases += [("train.py --out " + rest, words) for rest, words in (("file", "--out"), ("file/below", "--out"), ("good", "--overwrite"),
+                                                                    ("rows", "--overwrite"))]
+    cases += [(resume + rest, words) for rest, words in (
+        [(name, "not a readable checkpoint") for name in ("list", "other-z", "swapped", "stranger", "code", "old", "half", "empty", "text", "rows", "file")]
+        + [("nan", "not finite"), ("good --encoder rn", "--encoder"), ("good --distractors 1", "--distractors"), ("good --seed 1", "--seed"),
+           ("good --task lift", "--task"), ("good --set z_dim=7", "z_dim"), ("good --frames 7", "frames"), ("good --ranks 1", "ranks")])]
+    cases += [(play + rest, words) for rest, words in (
+        [(name, "not a readable checkpoint") for name in ("none", "text", "half", "code", "file")] + [
+            ("nan", "not finite"), ("good --distractors x", "--distractors"), ("good --distractors 5-2", "--distractors"), ("good --distractors 30", "distractors"),
+            ("good --episodes -1", "--episodes"), ("good --episodes some", "--episodes"), ("", "RUN"), ("good --plot nowhere/a.png --episodes 0", "nowhere"),
+            ("good --gif nowhere/a.gif --episodes 0", "nowhere"), ("other --plot a.png --episodes 0", "other")])]
+    for folder, _, names in os.walk("."):
+        kept.update({os.path.join(folder, name): open(os.path.join(folder, name), "rb").read() for name in names})
+    for command, words in cases:
+        monkeypatch.setattr(sys, "argv", command.split())
         with pytest.raises(SystemExit) as stop:
-            (train if command[0] == "train.py" else evaluate).main()
-        error = capsys.readouterr().err.splitlines()
-        assert stop.value.code == 2 and len(error) == 1 and words in error[0], (command, error)
-    assert (tmp_path / "old" / "checkpoint.pt").read_text() == "not a checkpoint"
-    done = run("train.py", "--encoder", "gnn")                 # and once as a user sees it
+            (train if command.startswith("train.py") else evaluate).main()
+        error = [line for line in capsys.readouterr().err.splitlines() if "pybullet build time" not in line]
+        assert stop.value.code == 2 and len(error) == 1 and words in error[0], (command, stop.value.code, error)
+    assert len(cases) > 60 and not os.path.exists("new") and not os.path.exists("evil")
+    for path, content in kept.items():
+        assert open(path, "rb").read() == content, path
+    done = run(os.path.join(HERE, "train.py"), "--encoder", "gnn")             # and once as a user sees it
     assert done.returncode == 2 and "Traceback" not in done.stderr
 
 

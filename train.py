@@ -18,6 +18,7 @@ import signal
 import socket
 import sys
 import time
+from datetime import timedelta
 
 import numpy as np
 import torch
@@ -154,10 +155,14 @@ def load(path):
     path = os.path.join(path, "checkpoint.pt") if os.path.isdir(path) else path
     try:
         checkpoint = torch.load(path, weights_only=True, map_location="cpu")
+        missing = [key for key in ("task", "seed", "ranks", "update", "frames", "seconds", "optimizer") if key not in checkpoint]
+        missing += [key for key in SETTINGS if key not in checkpoint["settings"]]
+        if missing:
+            raise KeyError(" ".join(missing))
         agent = Agent(checkpoint["encoder"], checkpoint["distractors"], checkpoint["settings"])
         agent.load_state_dict({key[6:]: value for key, value in checkpoint["learner"].items() if key.startswith("agent.")})
     except Exception as error:                                 # torch.load raises many kinds; all mean the same to the user
-        raise ValueError(f"{path} is not a readable checkpoint of train.py ({type(error).__name__}: {str(error).splitlines()[0]})") from None
+        raise ValueError(f"{path} is not a readable checkpoint of train.py ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from None
     if not all(torch.isfinite(value).all() for value in checkpoint["learner"].values()):
         raise ValueError(f"{path} holds weights that are not finite")
     return checkpoint, agent
@@ -190,7 +195,7 @@ def train(args, settings):
         signal.signal(number, lambda *_: stop.append(True))
     torch.set_num_threads(1)
     if ranks > 1:
-        dist.init_process_group("gloo")
+        dist.init_process_group("gloo", timeout=timedelta(minutes=10))
     torch.manual_seed(args.seed)                               # every rank starts from the same weights
     agent = Agent(args.encoder, args.distractors, settings)
     envs = [make_env(args.task, args.distractors, settings) for _ in range(settings["envs"] // ranks)]
@@ -261,8 +266,9 @@ def train(args, settings):
 
 
 
-def start_rank(rank, ranks, port, *arguments):
-    os.environ.update(RANK=str(rank), WORLD_SIZE=str(ranks), MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
+def start_rank(index, *arguments):
+    """One of the ranks 1, 2, ...; rank 0 is the process that starts them."""
+    os.environ["RANK"] = str(index + 1)
     train(*arguments)
 
 
@@ -291,18 +297,24 @@ def parse(argv=None):
     args = parser.parse_args(argv)
     args.out = args.out or os.path.join("runs", f"{args.task}-{args.encoder}-n{args.distractors}-seed{args.seed}")
     settings = {key: value[1 if args.paper else 0] for key, value in SETTINGS.items()}
-    for item in args.set + ([f"frames={args.frames}"] if args.frames is not None else []):
+    changes = [("--set", item) for item in args.set] + [("--frames", f"frames={args.frames}")] * (args.frames is not None)
+    for flag, item in changes:
         key, _, text = item.partition("=")
         if key not in settings:
-            fail(f"--set {item}: no such setting; the names are {', '.join(settings)}")
-        kind = type(settings[key])
+            fail(f"{flag} {item}: no such setting; the names are {', '.join(settings)}")
+        kind, signed = type(settings[key]), key.startswith(("reward_", "log_std"))
         try:
-            settings[key] = {"True": True, "False": False}[text] if kind is bool else kind(text)
+            value = {"True": True, "False": False}[text] if kind is bool else kind(text)
         except (KeyError, ValueError):
-            fail(f"--set {item}: expected {key}=<{kind.__name__}>")
+            fail(f"{flag} {item}: expected {key}=<{kind.__name__}>")
+        if kind is not bool and not (math.isfinite(value) and (signed or value >= (kind is int))):
+            fail(f"{flag} {item}: expected {'an integer >= 1' if kind is int else 'a finite number' if signed else 'a number >= 0'}")
+        settings[key] = value
     if "WORLD_SIZE" in os.environ:                             # started by torchrun
         args.ranks = int(os.environ["WORLD_SIZE"])
     file, rows = os.path.join(args.out, "checkpoint.pt"), os.path.join(args.out, "progress.csv")
+    if args.resume and args.overwrite:
+        fail("--resume goes on with a run, --overwrite starts anew: give one of them")
     if args.resume:
         try:
             checkpoint, _ = load(file)
@@ -325,10 +337,8 @@ def parse(argv=None):
         divides = [r for r in range(1, os.cpu_count() + 1) if settings["envs"] % r == 0
                    and settings["envs"] // r * settings["steps"] % settings["minibatches"] == 0]
         args.ranks = max(divides, default=1)
-    if args.ranks < 1 or settings["envs"] < 1 or settings["envs"] % args.ranks:
+    if args.ranks < 1 or settings["envs"] % args.ranks:
         fail(f"--ranks {args.ranks} must divide the number of environments, {settings['envs']}")
-    if settings["frames"] < 1:
-        fail(f"--frames must be at least 1, got {settings['frames']}")
     try:                                                       # let the parts check their own arguments
         make_env(args.task, args.distractors, settings).close()
         PPO(Agent(args.encoder, args.distractors, settings), [None] * (settings["envs"] // args.ranks), steps=settings["steps"],
@@ -350,14 +360,16 @@ def main():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    context = mp.start_processes(start_rank, (args.ranks, port, args, settings), args.ranks, join=False, start_method="spawn")
-    for number in (signal.SIGINT, signal.SIGTERM):             # pass the wish to stop on; the ranks end with a checkpoint
-        signal.signal(number, lambda *_: [process.terminate() for process in context.processes])
+    os.environ.update(RANK="0", WORLD_SIZE=str(args.ranks), MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
+    others = mp.start_processes(start_rank, (args, settings), args.ranks - 1, join=False, start_method="spawn")
     try:
-        while not context.join():
-            pass
-    except mp.ProcessExitedException as error:                 # what the rank itself had to say stands above
-        fail(f"the run ended with a rank: {error}", status=1)
+        train(args, settings)
+    except RuntimeError as error:                              # a rank that is gone breaks the others' connections
+        try:
+            others.join()
+        except mp.ProcessExitedException as exit:              # killed from outside; an error of its own shows itself
+            fail(f"{exit}, so the run ends here; --resume goes on from the last checkpoint", status=1)
+        raise error
 
 
 if __name__ == "__main__":

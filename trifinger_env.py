@@ -222,7 +222,8 @@ class TriFingerEnv:
         """Make floor, wall, robot, cubes and the goal's picture anew."""
         c = {"physicsClientId": self._client}
         pb.resetSimulation(**c)
-        pb.setPhysicsEngineParameter(fixedTimeStep=self.timestep, numSolverIterations=8, deterministicOverlappingPairs=1, **c)
+        pb.setPhysicsEngineParameter(fixedTimeStep=self.timestep, numSolverIterations=8, deterministicOverlappingPairs=1,
+                                     enableFileCaching=0, **c)             # or each new world keeps a copy of its URDF for ever
         pb.setGravity(0, 0, -9.81, **c)
 
         def picture(shape, color, **size):                     # -1: no visual shape, which makes building twice as fast
