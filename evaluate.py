@@ -201,7 +201,8 @@ def plot(runs, path):
     for axes in (left, right):
         axes.set_ylim(0, 1)
         axes.grid(alpha=0.3)
-        axes.legend()
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend()
     figure.savefig(path, dpi=120)
     print(f"wrote {path}")
 

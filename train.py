@@ -307,7 +307,7 @@ def parse(argv=None):
             value = {"True": True, "False": False}[text] if kind is bool else kind(text)
         except (KeyError, ValueError):
             fail(f"{flag} {item}: expected {key}=<{kind.__name__}>")
-        if kind is not bool and not (math.isfinite(value) and (signed or value >= (kind is int))):
+        if kind in (int, float) and not (math.isfinite(value) and (signed or value >= (kind is int))):
             fail(f"{flag} {item}: expected {'an integer >= 1' if kind is int else 'a finite number' if signed else 'a number >= 0'}")
         settings[key] = value
     if "WORLD_SIZE" in os.environ:                             # started by torchrun
