@@ -13,12 +13,13 @@ import csv
 import multiprocessing
 import os
 import re
+import signal
 
 import numpy as np
 import torch
 
 from train import fail, load, make_env
-from trifinger_env import CUBE
+from trifinger_env import CUBE, CUBE_SCALE
 
 COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict", "solved", "cut_short",
            "blocked", "success_clear", "success_blocked", "z_drift")
@@ -32,7 +33,7 @@ def episode_seed(episode):
 
 def is_blocked(obs):
     """Does a distractor's centre lie within a cube's width of the straight line from the target to the goal?"""
-    here, goal = obs["cubes"][:, 4:6] * 0.2, obs["goal"][4:6] * 0.2            # m, see CUBE_SCALE
+    here, goal = obs["cubes"][:, 4:6] * CUBE_SCALE[4], obs["goal"][4:6] * CUBE_SCALE[4]        # m
     target = obs["cubes"][:, -1] == obs["goal"][-1]
     start, others = here[target][0], here[~target]                             # (2,), (N, 2)
     share = np.clip((others - start) @ (goal - start) / max(np.square(goal - start).sum(), 1e-12), 0, 1)
@@ -40,42 +41,44 @@ def is_blocked(obs):
 
 
 @torch.inference_mode()
-def play(path, distractors, first, count, mean_actions):
-    """Play episodes first .. first+count-1 of the agent in `path`. Returns a row of five numbers for each:
+def play(path, numbers, first, count, mean_actions):
+    """Play episodes first .. first+count-1 of the agent in `path` at every N in `numbers`: {N: a row of five numbers each}.
 
     rho, strict rho, was it cut short, was the way to the goal blocked at the start, and the drift of z: how far the first
     z lies from the z of the same episode at the training N, over the mean distance between different episodes there.
     """
     torch.set_num_threads(1)
-    checkpoint, agent = load(path)
+    (checkpoint, agent), seeds, results = load(path), [episode_seed(first + e) for e in range(count)], {}
 
     def batch(observations):
         return {key: torch.from_numpy(np.stack([obs[key] for obs in observations])) for key in observations[0]}
 
     def start(n):
-        envs = [make_env(checkpoint["task"], n, checkpoint["settings"]) for _ in range(count)]
-        return envs, [env.reset(seed=episode_seed(first + e))[0] for e, env in enumerate(envs)]
+        envs = [make_env(checkpoint["task"], n, checkpoint["settings"]) for _ in seeds]
+        observations = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds)]
+        return envs, observations, agent.encode(batch(observations))           # z (B, Z)
 
-    trained, there = start(checkpoint["distractors"])
+    trained, _, z_trained = start(checkpoint["distractors"])
     for env in trained:
         env.close()
-    envs, observations = start(distractors)
-    z, z_there = agent.encode(batch(observations)), agent.encode(batch(there))                 # (B, Z)
-    drift = (z - z_there).norm(dim=1) / (torch.cdist(z_there, z_there).sum() / max(count * (count - 1), 1))
-    blocked, results = [is_blocked(obs) for obs in observations], [None] * count
-    noise = [np.random.default_rng(episode_seed(first + e)) for e in range(count)]
-    while None in results:
-        mean, log_std, _ = agent(batch(observations))
-        mean, std = mean.numpy(), log_std.exp().numpy()
-        for e, env in enumerate(envs):
-            if results[e] is None:
-                action = mean[e] if mean_actions else mean[e] + std * noise[e].standard_normal(9)
-                observations[e], _, _, truncated, info = env.step(action)
-                if truncated:
-                    results[e] = (info["fractional_success"], info["fractional_success_strict"], info["truncated_by"] != "time",
-                                  blocked[e], drift[e].item())
-    for env in envs:
-        env.close()
+    for n in numbers:
+        envs, observations, z = start(n)
+        drift = (z - z_trained).norm(dim=1) / (torch.cdist(z_trained, z_trained).sum() / max(count * (count - 1), 1))
+        blocked, rows = [is_blocked(obs) for obs in observations], [None] * count
+        noise = [np.random.default_rng(seed) for seed in seeds]
+        while None in rows:
+            mean, log_std, _ = agent(batch(observations))
+            mean, std = mean.numpy(), log_std.exp().numpy()
+            for e, env in enumerate(envs):
+                if rows[e] is None:
+                    action = mean[e] if mean_actions else mean[e] + std * noise[e].standard_normal(9)
+                    observations[e], _, _, truncated, info = env.step(action)
+                    if truncated:
+                        rows[e] = (info["fractional_success"], info["fractional_success_strict"], info["truncated_by"] != "time",
+                                   blocked[e], drift[e].item())
+        for env in envs:
+            env.close()
+        results[n] = rows
     return results
 
 
@@ -92,23 +95,29 @@ def summary(distractors, results):
 def evaluate(run, distractors, episodes, mean_actions=False):
     """Play `episodes` episodes at every N in `distractors` on all cores; prints, writes and returns the rows."""
     checkpoint, _ = load(run)
+    name = "zeroshot-mean.csv" if mean_actions else "zeroshot.csv"
+    path = os.path.join(run, name)
+    if os.path.exists(path) and tuple(read(run, name)) != COLUMNS:             # refused before the play, not after it
+        raise ValueError(f"{path} has other columns than this version writes: remove it first")
     if checkpoint["encoder"] == "mlp" and any(n != checkpoint["distractors"] for n in distractors):
         print(f"{run}: an mlp has a fixed input, so it can be played at its own N = {checkpoint['distractors']} only")
         distractors = [n for n in distractors if n == checkpoint["distractors"]]
-    chunks = [(n, first, min(CHUNK, episodes - first)) for n in distractors for first in range(0, episodes, CHUNK)]
+    if not distractors:
+        return []
+    chunks = [(run, distractors, first, min(CHUNK, episodes - first), mean_actions) for first in range(0, episodes, CHUNK)]
     print(f"{run}: {checkpoint['encoder']} trained on {checkpoint['task']} with {checkpoint['distractors']} distractors, "
           f"{checkpoint['frames']} frames, {'mean' if mean_actions else 'sampled'} actions")
     print("   N  episodes  success (axis-aligned)  success (strict)  solved  cut short   way clear  way blocked (share)   drift of z")
-    with multiprocessing.get_context("spawn").Pool(min(os.cpu_count(), len(chunks) or 1)) as pool:
-        parts = pool.starmap(play, [(run, *chunk, mean_actions) for chunk in chunks], chunksize=1)
+    # Ctrl-C is for the main process alone: leaving the pool ends the others.
+    with multiprocessing.get_context("spawn").Pool(min(os.cpu_count(), len(chunks)), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+        parts = pool.starmap(play, chunks, chunksize=1)
     rows = []
     for n in distractors:
-        rows.append(summary(n, [r for chunk, part in zip(chunks, parts) if chunk[0] == n for r in part]))
+        rows.append(summary(n, [row for part in parts for row in part[n]]))
         print("{distractors:4d} {episodes:9d}        {success_aabb:.3f} +- {ci95:.3f}    {success_strict:.3f} +- {ci95_strict:.3f}   "
               "{solved:.3f} {cut_short:10d}       {success_clear:.3f}        {success_blocked:.3f} ({blocked:.2f})        {z_drift:.3f}"
               .format(**rows[-1]), flush=True)
-    if rows and os.path.isdir(run):
-        path = os.path.join(run, "zeroshot-mean.csv" if mean_actions else "zeroshot.csv")
+    if os.path.isdir(run):
         lines = {row["distractors"]: [str(row[key]) if isinstance(row[key], int) else f"{row[key]:.4f}" for key in COLUMNS] for row in rows}
         if os.path.exists(path):                               # rows of other N stay
             with open(path, newline="") as file:
@@ -137,6 +146,11 @@ def by_seed(runs):
     return groups
 
 
+def evaluated(members):
+    """Have all these runs been played?"""
+    return all(os.path.exists(os.path.join(run, "zeroshot.csv")) for run in members)
+
+
 def over_seeds(runs, key):
     """{N: (mean, half width)} of a column of the runs' zeroshot.csv: a 95 % interval over the episodes of one run, or,
     with several, over the seeds (Student's t, which is wide for few)."""
@@ -158,8 +172,7 @@ def over_seeds(runs, key):
 
 def table(runs):
     """Print README's table of the runs that have been evaluated."""
-    groups = {name: members for name, members in by_seed(runs).items()
-              if all(os.path.exists(os.path.join(run, "zeroshot.csv")) for run in members)}
+    groups = {name: members for name, members in by_seed(runs).items() if evaluated(members)}
     columns = {(name, key): over_seeds(members, key) for name, members in groups.items() for key in ("success_aabb", "success_strict", "solved")}
     numbers = sorted({n for cells in columns.values() for n in cells})
     if not numbers:
@@ -192,7 +205,7 @@ def plot(runs, path):
             line, = left.plot(frames, np.mean(smooth, 0), style, label=name if style == "-" else None, color=color)
             color = line.get_color()
             left.fill_between(frames, np.min(smooth, 0), np.max(smooth, 0), color=color, alpha=0.15, linewidth=0)
-            if all(os.path.exists(os.path.join(run, "zeroshot.csv")) for run in members):
+            if evaluated(members):
                 cells = over_seeds(members, key)
                 right.errorbar(list(cells), *zip(*cells.values()), linestyle=style, marker="o", markersize=3, capsize=3, color=color,
                                label=name if style == "-" else None)
@@ -256,6 +269,9 @@ def main():
     numbers = parse_range(args.distractors)
     if args.episodes < 0:
         fail(f"--episodes must be at least 0, got {args.episodes}")
+    for flag, path in (("--plot", args.plot), ("--gif", args.gif)):
+        if path and not os.path.isdir(os.path.dirname(path) or "."):
+            fail(f"{flag} {path}: there is no folder {os.path.dirname(path)}")
     try:
         for run in args.runs:
             checkpoint, _ = load(run)
@@ -270,6 +286,8 @@ def main():
             film(args.runs[0], numbers[0], args.gif)
     except (ValueError, OSError) as error:
         fail(str(error))
+    except KeyboardInterrupt:
+        fail("stopped; runs that were played to the end have their CSV", status=130)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
 """Tests of everything, each against something independent: a slow loop, torch's own layer, PyBullet, a hand-computed case.
 
-Run:    pytest -q        under 3 minutes on 2 cores
+Run:    pytest -q                                        under 3 minutes on 2 cores
+        SLOW=1 pytest -q -s -k "soak or killed_and or mutation"     12 M environment steps, 40 kills, one mutation per module: 2 hours
 """
+import ast
 import csv
 import math
 import os
@@ -26,6 +28,7 @@ from ppo import PPO, PointOnLine, TinyAgent, gae, normal_log_prob
 from rn import RN
 from trifinger_env import TriFingerEnv
 
+SLOW = bool(os.environ.get("SLOW"))
 HERE = os.path.dirname(os.path.abspath(__file__))
 D = 64
 torch.set_num_threads(1)
@@ -289,7 +292,7 @@ def test_observation_is_table_1(env):
         q, dq = ([state[i] for state in states[3 * k:3 * k + 3]] for i in (0, 1))
         np.testing.assert_allclose(row, [*q, *dq, k - 1, *tri.forward_kinematics(k, q)], atol=1e-5)
     np.testing.assert_allclose(obs["goal"] * tri.GOAL_SCALE, [1, *[tri.CUBE] * 3, *env.goal[0], *env.goal[1], env._ids[env.target]], atol=1e-5)
-    assert (obs["cubes"][:, -1] == obs["goal"][-1]).sum() == 1 and len(set(env._ids)) == 3
+    assert (obs["cubes"][:, -1] == obs["goal"][-1]).sum() == 1 and len(set(env._ids)) == 3 and np.abs(env._ids).max() <= 1
     # the scaling itself, in numbers: 0.2 m, 1.5 rad and a cube's edge are 1
     np.testing.assert_allclose(obs["cubes"][0, [1, 4, 5, 6]], [1, *np.array(env._poses[0][0]) / 0.2], atol=1e-5)
     np.testing.assert_allclose(obs["fingers"][1, [0, 6, 9]], [states[3][0] / 1.5, 0, env._tips[1][2] / 0.2], atol=1e-5)
@@ -389,10 +392,53 @@ def test_episode_ends_by_truncation_with_a_named_reason():
     env.reset()
     pb.resetBasePositionAndOrientation(env._cubes[0], [0.5, 0, 0.1], [0, 0, 0, 1], physicsClientId=env._client)
     assert env.step(np.zeros(9))[4]["truncated_by"] == "a cube left the arena"
-    env.reset()
-    pb.resetBaseVelocity(env._cubes[1], [float("nan")] * 3, physicsClientId=env._client)
-    assert env.step(np.zeros(9))[4]["truncated_by"] == "the physics diverged"
+    for kind in ("linearVelocity", "angularVelocity", "joints"):
+        before = env.reset()[0]
+        if kind == "joints":
+            pb.resetJointState(env._robot, 4, 0.0, float("nan"), physicsClientId=env._client)
+        else:
+            pb.resetBaseVelocity(env._cubes[1], **{kind: [float("nan")] * 3}, physicsClientId=env._client)
+        obs, reward, terminated, truncated, info = env.step(np.zeros(9))
+        assert info["truncated_by"] == "the physics diverged" and truncated and not terminated, kind
+        assert reward == info["fractional_success"] == info["fractional_success_strict"] == sum(info["rewards"].values()) == 0
+        assert all(np.array_equal(obs[key], before[key]) for key in before)    # the last sound one
+        with pytest.raises(RuntimeError, match="reset"):
+            env.step(np.zeros(9))
+        env.reset()
+        assert all(np.isfinite(value).all() for _ in range(4) for value in env.step(np.zeros(9))[0].values()), kind
     env.close()
+
+
+def memory():
+    """Resident memory of this process in MiB (Linux)."""
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2 ** 20
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="reads memory from /proc")
+@pytest.mark.parametrize("kind", ["random", "bang-bang"])
+@pytest.mark.parametrize("task", ["push", "lift"])
+@pytest.mark.parametrize("n", [0, 2, 9])
+def test_soak(n, task, kind):
+    """Random actions, and full speed this way and that: nothing but finite numbers, every end named, memory flat."""
+    steps, env, rng, ends, held = 1_000_000 if SLOW else 500, TriFingerEnv(task, n, episode_steps=125), np.random.default_rng(n), {}, []
+    env.reset(seed=0)
+    for step in range(steps):
+        if kind == "random":
+            action = rng.uniform(-1, 1, 9)
+        elif step % 10 == 0:
+            action = np.sign(rng.uniform(-1, 1, 9))
+        obs, reward, _, truncated, info = env.step(action)
+        assert math.isfinite(reward + info["fractional_success"]) and all(np.isfinite(value).all() for value in obs.values()), step
+        if truncated:
+            assert math.isfinite(info["fractional_success_strict"])
+            ends[info["truncated_by"]] = ends.get(info["truncated_by"], 0) + 1
+            env.reset(seed=step if step % 2 else None)
+        if step % (steps // 10) == 0:
+            held.append(memory())
+    env.close()
+    print(f"\n{task} N={n} {kind}: {steps} steps, ends {ends}, memory {held[1]:.1f} MiB after a tenth, {held[-1]:.1f} at the end")
+    assert set(ends) <= {"time", "a cube left the arena", "the physics diverged"} and ends["time"] >= 0.9 * steps / 125
+    assert held[-1] - held[1] < 3, held
 
 
 def test_bad_arguments_and_actions_are_refused():
@@ -644,9 +690,16 @@ def test_checkpoint_evaluates_at_other_numbers_of_distractors(trained):
     assert done.returncode == 0, done.stderr
     rows = evaluate.read(trained, "zeroshot.csv")
     assert rows["distractors"].tolist() == [0, 3] and rows["episodes"].tolist() == [6, 6]
-    first = (evaluate.play(trained, 3, 0, 6, False), evaluate.summary(3, evaluate.play(trained, 3, 0, 6, False)))
-    assert first[1]["success_aabb"] == pytest.approx(rows["success_aabb"][1], abs=1e-4)      # the same numbers again
-    assert np.mean([result[0] for result in first[0]]) == pytest.approx(first[1]["success_aabb"])
+    again = evaluate.play(trained, [3], 0, 6, False)[3]                        # alone and in this process: the same numbers
+    assert np.mean([result[0] for result in again]) == pytest.approx(rows["success_aabb"][1], abs=1e-4)
+
+
+def test_summary_of_four_episodes_by_hand():
+    row = evaluate.summary(5, [(1.0, 0.8, False, True, 0.1), (0.0, 0.0, True, False, 0.3), (0.9, 0.7, False, False, 0.1), (0.1, 0.1, False, False, 0.1)])
+    expected = {"distractors": 5, "episodes": 4, "success_aabb": 0.5, "success_strict": 0.4, "solved": 0.5, "cut_short": 1, "blocked": 0.25,
+                "success_clear": 1 / 3, "success_blocked": 1.0, "z_drift": 0.15, "ci95": 1.96 * math.sqrt(0.82 / 3) / 2,
+                "ci95_strict": 1.96 * math.sqrt(0.5 / 3) / 2}                   # sums of squared deviations: 0.82 and 0.5
+    assert row == pytest.approx(expected)
 
 
 def test_blocked_ways_and_the_drift_of_z(trained):
@@ -656,7 +709,7 @@ def test_blocked_ways_and_the_drift_of_z(trained):
     for x, y, blocks in ((0.0, 0.06, True), (0.0, 0.07, False), (0.16, 0.0, True), (0.17, 0.0, False), (-0.14, 0.04, True), (-0.15, 0.05, False)):
         obs["cubes"][0, 4:6], obs["cubes"][1, 4:6] = np.divide([x, y], 0.2), np.divide([0.0, -0.2], 0.2)
         assert evaluate.is_blocked(obs) == blocks, (x, y)
-    same, other = (np.array(evaluate.play(trained, n, 0, 4, False), float) for n in (0, 3))        # trained with 0 distractors
+    same, other = (np.array(rows, float) for rows in evaluate.play(trained, [0, 3], 0, 4, False).values())        # trained with 0
     assert (same[:, 4] == 0).all() and (other[:, 4] > 0.01).all() and (same[:, 3] == 0).all()
 
 
@@ -691,22 +744,69 @@ def test_other_encoders_train_and_the_mlp_says_why_it_cannot_change_n(kind, tmp_
     assert len(evaluate.read(str(tmp_path / "run"), "zeroshot.csv")["episodes"]) == (1 if kind == "mlp" else 2)
 
 
+def alive(group):
+    """Processes of a process group that are not dead (state Z: dead, not yet collected)."""
+    found = []
+    for pid in filter(str.isdigit, os.listdir("/proc")):
+        try:
+            state, _, pgrp = open(f"/proc/{pid}/stat").read().rpartition(")")[2].split()[:3]
+        except OSError:                                        # gone in between
+            continue
+        found += [int(pid)] if pgrp == str(group) and state != "Z" else []
+    return found
+
+
+def wait_for_the_end_of(group):
+    begin = time.monotonic()
+    while alive(group):
+        assert time.monotonic() - begin < 30, alive(group)
+        time.sleep(0.05)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="looks for processes in /proc")
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_stopped_and_resumed_equals_never_stopped(ranks, tmp_path):
-    """SIGTERM in the middle, then --resume: bit-equal weights and byte-equal progress.csv."""
-    command = ["train.py", "--distractors", "1", "--ranks", str(ranks), "--frames", "1600", *SMALL]
+def test_stopped_killed_and_resumed_equals_never_stopped(ranks, tmp_path):
+    """SIGTERM (to the first process) or Ctrl-C (to all), then kill -9 at random moments, every other one while a checkpoint is
+    being written, each time followed by --resume: bit-equal weights and byte-equal progress.csv in the end."""
+    kills, rng, cut, seen, inside, slowest = 20 if SLOW else 1, np.random.default_rng(ranks), tmp_path / "cut", 0, 0, 0.0
+    command = ["train.py", "--distractors", "1", "--ranks", str(ranks), "--save-minutes", "0", "--frames", str(200 * (8 + 8 * kills)), *SMALL]
     assert run(*command, "--out", str(tmp_path / "whole")).returncode == 0
-    process = subprocess.Popen([sys.executable, *command, "--out", str(tmp_path / "cut")], cwd=HERE, stdout=subprocess.PIPE, text=True)
-    for line in process.stdout:
-        if line.startswith("update 2/"):
-            process.send_signal(signal.SIGTERM)
-            break
-    assert "stopped after" in process.communicate(timeout=60)[0] and process.returncode == 0
-    assert run(*command, "--out", str(tmp_path / "cut"), "--resume").returncode == 0
-    whole, cut = (torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("whole", "cut"))
-    assert whole["update"] == cut["update"] == 8
-    assert all(torch.equal(value, cut["learner"][key]) for key, value in whole["learner"].items())
-    assert (tmp_path / "whole" / "progress.csv").read_bytes() == (tmp_path / "cut" / "progress.csv").read_bytes()
+    for number in range(kills + 1):
+        process = subprocess.Popen([sys.executable, *command, "--out", str(cut), *(["--resume"] if number else [])], cwd=HERE,
+                                   stdout=subprocess.PIPE, text=True, start_new_session=True)
+        updates = int(rng.integers(0, 5)) if number else 2
+        for line in process.stdout if updates else ():
+            if line.startswith("update "):
+                seen, updates = int(line[7:].split("/")[0]), updates - 1
+                if not updates:
+                    break
+        if number % 2:
+            while process.poll() is None and not os.path.exists(cut / "checkpoint.pt.tmp"):
+                pass
+        elif number:
+            time.sleep(rng.uniform(0, 0.3 if seen else 4.0))
+        begin = time.monotonic()
+        if number or ranks > 1:
+            os.killpg(process.pid, signal.SIGKILL if number else signal.SIGINT)
+        else:
+            process.terminate()
+        rest = process.communicate(timeout=60)[0]
+        wait_for_the_end_of(process.pid)
+        if not number:
+            slowest = time.monotonic() - begin
+            assert process.returncode == 0 and "stopped after" in rest and slowest < 10
+            (cut / "zeroshot.csv").write_text("of the old weights")
+        inside += os.path.exists(cut / "checkpoint.pt.tmp")
+        for line in rest.splitlines():
+            seen = int(line[7:].split("/")[0]) if line.startswith("update ") else seen
+        kept = train.load(str(cut))[0]["update"]
+        assert kept >= seen - 1                                # a checkpoint follows every update here
+    print(f"\n{ranks} ranks: stopped in {slowest:.1f} s; {kills} kills, {inside} inside the writing, the last at update {kept}")
+    assert run(*command, "--out", str(cut), "--resume").returncode == 0
+    whole, ours = (torch.load(folder / "checkpoint.pt", weights_only=True) for folder in (tmp_path / "whole", cut))
+    assert whole["update"] == ours["update"] == 8 + 8 * kills and not os.path.exists(cut / "zeroshot.csv")
+    assert all(torch.equal(value, ours["learner"][key]) for key, value in whole["learner"].items())
+    assert (tmp_path / "whole" / "progress.csv").read_bytes() == (cut / "progress.csv").read_bytes()
 
 
 def test_resume_drops_rows_after_the_checkpoint_and_torn_lines(tmp_path):
@@ -724,31 +824,20 @@ def test_torchrun_starts_the_same_file(tmp_path):
     assert train.load(str(tmp_path / "run"))[0]["frames"] == 400
 
 
-def status(pid):
-    """A process's line of /proc/PID/stat from its state on (Z: dead, not yet collected); "Z" if it is gone."""
-    try:
-        return open(f"/proc/{pid}/stat").read().rpartition(")")[2].split()
-    except OSError:
-        return "Z"
-
-
 @pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="looks for processes in /proc")
 @pytest.mark.parametrize("victim", [0, 1])
 def test_a_killed_rank_ends_the_run_and_leaves_nobody_behind(victim, tmp_path):
     command = [sys.executable, "train.py", "--ranks", "2", "--out", str(tmp_path / "run"), *SMALL]
-    process = subprocess.Popen(command, cwd=HERE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, cwd=HERE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
     for line in process.stdout:
         if line.startswith("update 2/"):
             break
-    children = [int(p) for p in os.listdir("/proc") if p.isdigit() and status(p)[1:2] == [str(process.pid)]]
-    other, = (p for p in children if b"spawn_main" in open(f"/proc/{p}/cmdline", "rb").read())
+    other, = (p for p in alive(process.pid) if b"spawn_main" in open(f"/proc/{p}/cmdline", "rb").read())
     os.kill((process.pid, other)[victim], signal.SIGKILL)
-    error, begin = process.communicate(timeout=60)[1], time.monotonic()
+    error = process.communicate(timeout=60)[1]
     if victim:
         assert process.returncode == 1 and "SIGKILL" in error and "--resume" in error and "Traceback" not in error, error
-    while any(status(p)[0] != "Z" for p in children):
-        assert time.monotonic() - begin < 30
-        time.sleep(0.1)
+    wait_for_the_end_of(process.pid)
 
 
 def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_checkpoint(tmp_path, capsys, monkeypatch):
@@ -790,6 +879,12 @@ def bad(tmp_path, trained, monkeypatch):
         os.mkdir(name)
         with open(os.path.join(name, "checkpoint.pt"), "wb") as file:
             file.write(content)
+    for name, content in (("torn", "distractors,episodes\n2,"), ("foreign", "a,b\n1,2\n")):
+        shutil.copytree("good", name)
+        with open(os.path.join(name, "zeroshot.csv"), "w") as file:
+            file.write(content)
+    os.mkdir("bare")
+    shutil.copy(os.path.join("good", "checkpoint.pt"), "bare")
     os.mkdir("rows")
     shutil.copy(os.path.join("good", "progress.csv"), "rows")
     with open("file", "w") as file:
@@ -817,7 +912,9 @@ def test_bad_input_ends_with_one_line_and_status_2(bad, capsys, monkeypatch):
         [(name, "not a readable checkpoint") for name in ("none", "text", "half", "code", "file")] + [
             ("nan", "not finite"), ("good --distractors x", "--distractors"), ("good --distractors 5-2", "--distractors"), ("good --distractors 30", "distractors"),
             ("good --episodes -1", "--episodes"), ("good --episodes some", "--episodes"), ("", "RUN"), ("good --plot nowhere/a.png --episodes 0", "nowhere|--plot needs"),
-            ("good --gif nowhere/a.gif --episodes 0", "nowhere|--gif needs"), ("other --plot a.png --episodes 0", "other")])]
+            ("good --gif nowhere/a.gif --episodes 0", "nowhere|--gif needs"), ("other --plot a.png --episodes 0", "other"),
+            ("bare --plot a.png --episodes 0", "progress.csv|--plot needs"), ("torn", "zeroshot.csv"), ("foreign", "zeroshot.csv"),
+            ("good --plot nowhere/a.png", "--plot"), ("good --gif nowhere/a.gif", "--gif")])]
     for folder, _, names in os.walk("."):
         kept.update({os.path.join(folder, name): open(os.path.join(folder, name), "rb").read() for name in names})
     for command, words in cases:
@@ -831,6 +928,46 @@ def test_bad_input_ends_with_one_line_and_status_2(bad, capsys, monkeypatch):
         assert open(path, "rb").read() == content, path
     done = run(os.path.join(HERE, "train.py"), "--encoder", "gnn")             # and once as a user sees it
     assert done.returncode == 2 and "Traceback" not in done.stderr
+
+
+def test_nothing_is_unpickled_or_downloaded():
+    """torch.load only with weights_only; nothing that could run code or reach the network is imported."""
+    known = {"argparse", "csv", "datetime", "math", "multiprocessing", "os", "re", "signal", "socket", "sys", "tempfile", "time", "numpy",
+             "torch", "pybullet", "matplotlib", "PIL", "lrn", "rn", "attn", "ppo", "train", "trifinger_env"}
+    for name in ("lrn.py", "rn.py", "attn.py", "ppo.py", "trifinger_env.py", "train.py", "evaluate.py"):
+        for node in ast.walk(ast.parse(open(os.path.join(HERE, name)).read())):
+            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module] if isinstance(node, ast.ImportFrom) else []
+            assert {module.split(".")[0] for module in modules} <= known, (name, modules)
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("torch.load", "np.load"):
+                assert "weights_only=True" in ast.unparse(node), (name, ast.unparse(node))
+
+
+MUTATIONS = (                            # file, source, mutated source, the test that must fail
+    ("lrn.py", "return self.norm(self.f(total))", "return self.f(total)", "lrn_equals_the_loop"),                      # no LayerNorm
+    ("rn.py", "self.f(r.sum((1, 2)))", "self.f(r.sum((1, 2)) - r.diagonal(0, 1, 2).sum(-1))", "rn_equals_the_double"),   # no self pairs
+    ("attn.py", " / math.sqrt(D // self.heads)", "", "attention_equals_torch"),                                        # no scale
+    ("trifinger_env.py", "(last_to_goal - to_goal)", "(to_goal - last_to_goal)", "distance_term_pays"),                # sign as printed
+    ("trifinger_env.py", "np.linspace(-1.0, 1.0, 21)", "np.arange(21.0)", "observation_is_table_1"),                   # identifiers not scaled
+    ("trifinger_env.py", "if seed is not None or self._steps is None:", "if self._steps is None:", "same_seed_same_trajectory"),  # no rebuild
+    ("ppo.py", "lam * (1 - done[t])", "lam * (1 - terminated[t])", "gae_against"),                                     # GAE runs on after a truncation
+    ("ppo.py", "        dist.all_reduce(tensor)\n", "", "two_ranks_give"),                                             # ranks go their own ways
+    ("train.py", '        learner.optimizer.load_state_dict(checkpoint["optimizer"])\n', "", "killed_and_resumed"),
+    ("train.py", "int(row[0]) <= update", "True", "resume_drops_rows"),                                                # double rows
+    ("evaluate.py", "1e-12), 0, 1)", "1e-12), -9, 9)", "blocked_ways"),                                                # a line, not a segment
+    ("evaluate.py", "values.std(0, ddof=1)", "values.std(0)", "summary_of_four"))
+
+
+@pytest.mark.skipif(not SLOW, reason="takes minutes: SLOW=1")
+@pytest.mark.parametrize("name, source, mutated, test", MUTATIONS)
+def test_mutation_is_caught(name, source, mutated, test, tmp_path):
+    for file in os.listdir(HERE):
+        if file.endswith(".py"):
+            shutil.copy(os.path.join(HERE, file), tmp_path)
+    text = (tmp_path / name).read_text()
+    assert text.count(source) == 1
+    (tmp_path / name).write_text(text.replace(source, mutated))
+    done = run("-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-k", test, cwd=tmp_path, env={key: v for key, v in os.environ.items() if key != "SLOW"})
+    assert done.returncode == 1 and "1 failed" in done.stdout, done.stdout     # 1: tests ran and failed; 5 would be none found
 
 
 @pytest.mark.parametrize("name", ["lrn.py", "rn.py", "attn.py", "ppo.py", "trifinger_env.py"])

@@ -211,9 +211,20 @@ def train(args, settings):
     per_update = settings["envs"] * settings["steps"]
     total = math.ceil(settings["frames"] / per_update)
     paths = {name: os.path.join(args.out, name) for name in ("checkpoint.pt", "progress.csv", "timing.csv")}
+
+    def keep():
+        save({"encoder": args.encoder, "task": args.task, "distractors": args.distractors, "seed": args.seed, "ranks": ranks, "settings": settings,
+              "update": update, "frames": update * per_update, "seconds": seconds, "random_state": [args.seed, update],
+              "learner": learner.state_dict(), "optimizer": learner.optimizer.state_dict()}, paths["checkpoint.pt"])
+
     if rank == 0:
+        if not args.resume:
+            keep()                                             # a run can be resumed from its first moment on
         keep_rows(paths["progress.csv"], PROGRESS, update)
         keep_rows(paths["timing.csv"], TIMING, update)
+        for name in ("zeroshot.csv", "zeroshot-mean.csv"):     # what was measured on weights that are about to change
+            if update < total and os.path.exists(os.path.join(args.out, name)):
+                os.remove(os.path.join(args.out, name))
     saved = time.monotonic()
     while update < total:
         # All randomness of an update follows from (seed, update, rank): that is the whole random state of a run.
@@ -250,9 +261,7 @@ def train(args, settings):
                   f"solved {row['solved']:.2f} cut_short {row['cut_short']} kl {row['approx_kl']:.4f} clipped {row['clip_fraction']:.2f} "
                   f"explained {row['explained_variance']:.2f} std {row['std']:.2f} eta {(total - update) * elapsed / 60:.0f}min", flush=True)
             if stopping or update == total or time.monotonic() - saved > args.save_minutes * 60:
-                save({"encoder": args.encoder, "task": args.task, "distractors": args.distractors, "seed": args.seed, "ranks": ranks, "settings": settings,
-                      "update": update, "frames": update * per_update, "seconds": seconds, "random_state": [args.seed, update],
-                      "learner": learner.state_dict(), "optimizer": learner.optimizer.state_dict()}, paths["checkpoint.pt"])
+                keep()
                 saved = time.monotonic()
         if stopping:
             break
@@ -263,7 +272,6 @@ def train(args, settings):
         dist.destroy_process_group()
         sys.stdout.flush()
         os._exit(0)                                            # python's own shutdown may meet gloo's threads and abort
-
 
 
 def start_rank(index, *arguments):

@@ -189,7 +189,8 @@ class TriFingerEnv:
 
     info: fractional_success (axis-aligned, as CausalWorld), rewards (each weighted term by name; they add up to the
     reward); at an episode's last step also fractional_success_strict (oriented) and truncated_by ("time", "a cube left
-    the arena", "the physics diverged"). An episode never terminates: it is truncated, and counts as a success at rho >= 0.8.
+    the arena", "the physics diverged": then with the last sound observation, reward 0 and success 0). An episode never
+    terminates: it is truncated, and counts as a success at rho >= 0.8.
     """
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 25}
 
@@ -320,6 +321,7 @@ class TriFingerEnv:
         self._steps = 0
         if self.render_mode:
             self._paint()
+        self._read()
         observation = self._observe()
         self._distances = self._measure()
         return observation, {"fractional_success": self._rho}
@@ -348,6 +350,11 @@ class TriFingerEnv:
         for _ in range(self.substeps):
             pb.stepSimulation(c)
         self._steps += 1
+        reason = self._read() or ("time" if self._steps >= self.episode_steps else None)
+        if reason == "the physics diverged":                   # show the last sound observation; the next reset builds anew
+            self._steps = None
+            return self._seen, 0.0, False, True, {"fractional_success": 0.0, "fractional_success_strict": 0.0, "truncated_by": reason,
+                                                  "rewards": dict.fromkeys(self.reward_weights, 0.0)}
         observation = self._observe()
         last, last_to_goal, last_to_tips = self._distances
         position, to_goal, to_tips = self._distances = self._measure()
@@ -357,45 +364,45 @@ class TriFingerEnv:
                    "curiosity": w["curiosity"] * (1 - rho) ** 0.05 * math.log(math.dist(position, last) + 1e-5),
                    "reach": w["reach"] * (last_to_tips - to_tips)}
         info = {"fractional_success": rho, "rewards": rewards}
-        reason = self._trouble() or ("time" if self._steps >= self.episode_steps else None)
         if reason:
             info["truncated_by"], info["fractional_success_strict"] = reason, oriented_overlap(self._poses[self.target], self.goal)
         if self.render_mode == "human":
             time.sleep(self.substeps * self.timestep)
         return observation, sum(rewards.values()), False, reason is not None, info
 
+    def _read(self):
+        """Read joints and cubes from the simulator. Returns a reason to cut the episode short, or None."""
+        c, reason = self._client, None
+        self._q, self._dq, _, _ = zip(*pb.getJointStates(self._robot, JOINTS, c))
+        self._poses = [pb.getBasePositionAndOrientation(cube, c) for cube in self._cubes]
+        self._velocities = [pb.getBaseVelocity(cube, c) for cube in self._cubes]
+        for ((x, y, z), turn), (linear, angular) in zip(self._poses, self._velocities):
+            if not math.isfinite(x + y + z + sum(turn) + sum(linear) + sum(angular)):
+                return "the physics diverged"
+            if not (x * x + y * y < (WALL + 0.03) ** 2 and -0.03 < z < 1.0):
+                reason = "a cube left the arena"
+        # rad/s; full speed of all joints is about 80. Written so that NaN fails it.
+        return reason if sum(map(abs, self._dq)) < 1000 else "the physics diverged"
+
     def _observe(self):
-        """Read the simulator: joints, cube poses, rho. Returns the observation of Table 1, scaled, in fresh arrays."""
-        c, split, flat, self._poses = self._client, 18 * len(self._cubes), [], []
-        for cube, identifier in zip(self._cubes, self._ids):
-            position, turn = pose = pb.getBasePositionAndOrientation(cube, c)
-            linear, angular = pb.getBaseVelocity(cube, c)
-            self._poses.append(pose)
+        """The observation of Table 1 from what _read() read, scaled, in fresh arrays; also tips and rho."""
+        split, flat, q, dq = 18 * len(self._cubes), [], self._q, self._dq
+        for (position, turn), velocity, identifier in zip(self._poses, self._velocities, self._ids):
             if turn[3] < 0:                                    # q and -q are the same turn: show one of them
                 turn = (-turn[0], -turn[1], -turn[2], -turn[3])
-            flat += (1.0, CUBE, CUBE, CUBE, *position, *turn, *linear, *angular, identifier)
-        q, dq, _, _ = zip(*pb.getJointStates(self._robot, JOINTS, c))
-        self._q, self._dq = q, dq
+            flat += (1.0, CUBE, CUBE, CUBE, *position, *turn, *velocity[0], *velocity[1], identifier)
         self._tips = a, b, d = [forward_kinematics(k, q[3 * k:3 * k + 3]) for k in range(3)]
         flat += (*q[:3], *dq[:3], -1.0, *a, *q[3:6], *dq[3:6], 0.0, *b, *q[6:], *dq[6:], 1.0, *d, *self._goal_row)
         flat = np.array(flat, np.float32) * self._scale
         self._rho = aabb_overlap(self._poses[self.target], self.goal)
-        return {"cubes": flat[:split].reshape(-1, 18), "fingers": flat[split:-12].reshape(3, 10), "goal": flat[-12:]}
+        self._seen = {"cubes": flat[:split].reshape(-1, 18), "fingers": flat[split:-12].reshape(3, 10), "goal": flat[-12:]}
+        return self._seen
 
     def _measure(self):
         """Target cube's position, its distance to the goal, and the Frobenius norm of (fingertips - cube); all in m."""
         position, (a, b, c) = self._poses[self.target][0], self._tips
         return (position, math.dist(position, self.goal[0]),
                 math.hypot(math.dist(a, position), math.dist(b, position), math.dist(c, position)))
-
-    def _trouble(self):
-        """Reason to cut the episode short, or None. Comparisons are written so that NaN fails them."""
-        if not sum(map(abs, self._dq)) < 1000:                 # rad/s; full speed of all joints is about 80
-            return "the physics diverged"
-        for (x, y, z), _ in self._poses:
-            if not (x * x + y * y < (WALL + 0.03) ** 2 and -0.03 < z < 1.0):
-                return "a cube left the arena" if math.isfinite(x + y + z) else "the physics diverged"
-        return None
 
     def _paint(self):
         """Move the goal's picture and colour the cubes: target blue, distractors red (Figure 1)."""
