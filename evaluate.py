@@ -22,7 +22,7 @@ from train import fail, load, make_env
 from trifinger_env import CUBE, CUBE_SCALE
 
 COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict", "solved", "cut_short",
-           "blocked", "success_clear", "success_blocked", "z_drift")
+           "blocked", "success_clear", "success_blocked", "z_drift", "read_error")
 CHUNK = 25                                # episodes played side by side; fixed, so that results do not depend on the cores
 
 
@@ -42,10 +42,11 @@ def is_blocked(obs):
 
 @torch.inference_mode()
 def play(path, numbers, first, count, mean_actions):
-    """Play episodes first .. first+count-1 of the agent in `path` at every N in `numbers`: {N: a row of five numbers each}.
+    """Play episodes first .. first+count-1 of the agent in `path` at every N in `numbers`: {N: a row of six numbers each}.
 
-    rho, strict rho, was it cut short, was the way to the goal blocked at the start, and the drift of z: how far the first
-    z lies from the z of the same episode at the training N, over the mean distance between different episodes there.
+    rho, strict rho, was it cut short, was the way to the goal blocked at the start, and two measures of the first z: its
+    drift, the distance from the z of the same episode at the training N over the mean distance between different episodes
+    there; and how far from the target cube (m) the agent's read-out sees it (NaN if it was trained without one).
     """
     torch.set_num_threads(1)
     (checkpoint, agent), seeds, results = load(path), [episode_seed(first + e) for e in range(count)], {}
@@ -64,6 +65,8 @@ def play(path, numbers, first, count, mean_actions):
     for n in numbers:
         envs, observations, z = start(n)
         drift = (z - z_trained).norm(dim=1) / (torch.cdist(z_trained, z_trained).sum() / max(count * (count - 1), 1))
+        targets = torch.from_numpy(np.stack([obs["cubes"][obs["cubes"][:, -1] == obs["goal"][-1]][0, 4:7] for obs in observations]))
+        miss = np.nan * z[:, 0] if not checkpoint["settings"]["auxiliary"] else (agent.read_out(z)[:, :3] - targets).norm(dim=1) * CUBE_SCALE[4]
         blocked, rows = [is_blocked(obs) for obs in observations], [None] * count
         noise = [np.random.default_rng(seed) for seed in seeds]
         while None in rows:
@@ -75,7 +78,7 @@ def play(path, numbers, first, count, mean_actions):
                     observations[e], _, _, truncated, info = env.step(action)
                     if truncated:
                         rows[e] = (info["fractional_success"], info["fractional_success_strict"], info["truncated_by"] != "time",
-                                   blocked[e], drift[e].item())
+                                   blocked[e], drift[e].item(), miss[e].item())
         for env in envs:
             env.close()
         results[n] = rows
@@ -84,12 +87,12 @@ def play(path, numbers, first, count, mean_actions):
 
 def summary(distractors, results):
     """One row of zeroshot.csv; ci95 is the half width of the normal 95 % interval of the mean over episodes."""
-    values = np.array(results, float)                                          # (episodes, 5)
-    half = 1.96 * values.std(0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.full(5, np.nan)
+    values = np.array(results, float)                                          # (episodes, 6)
+    half = 1.96 * values.std(0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.full(6, np.nan)
     mean, rho, blocked = values.mean(0), values[:, 0], values[:, 3] > 0
     clear, behind = (rho[rows].mean() if rows.any() else np.nan for rows in (~blocked, blocked))
     return dict(zip(COLUMNS, (distractors, len(values), mean[0], mean[1], half[0], half[1], (rho >= 0.8).mean(), int(values[:, 2].sum()),
-                              mean[3], clear, behind, mean[4])))
+                              mean[3], clear, behind, mean[4], mean[5])))
 
 
 def evaluate(run, distractors, episodes, mean_actions=False):
@@ -107,7 +110,7 @@ def evaluate(run, distractors, episodes, mean_actions=False):
     chunks = [(run, distractors, first, min(CHUNK, episodes - first), mean_actions) for first in range(0, episodes, CHUNK)]
     print(f"{run}: {checkpoint['encoder']} trained on {checkpoint['task']} with {checkpoint['distractors']} distractors, "
           f"{checkpoint['frames']} frames, {'mean' if mean_actions else 'sampled'} actions")
-    print("   N  episodes  success (axis-aligned)  success (strict)  solved  cut short   way clear  way blocked (share)   drift of z")
+    print("   N  episodes  success (axis-aligned)  success (strict)  solved  cut short   way clear  way blocked (share)   drift of z   read error (mm)")
     # Ctrl-C is for the main process alone: leaving the pool ends the others.
     with multiprocessing.get_context("spawn").Pool(min(os.cpu_count(), len(chunks)), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
         parts = pool.starmap(play, chunks, chunksize=1)
@@ -115,8 +118,8 @@ def evaluate(run, distractors, episodes, mean_actions=False):
     for n in distractors:
         rows.append(summary(n, [row for part in parts for row in part[n]]))
         print("{distractors:4d} {episodes:9d}        {success_aabb:.3f} +- {ci95:.3f}    {success_strict:.3f} +- {ci95_strict:.3f}   "
-              "{solved:.3f} {cut_short:10d}       {success_clear:.3f}        {success_blocked:.3f} ({blocked:.2f})        {z_drift:.3f}"
-              .format(**rows[-1]), flush=True)
+              "{solved:.3f} {cut_short:10d}       {success_clear:.3f}        {success_blocked:.3f} ({blocked:.2f})        {z_drift:.3f} {mm:17.1f}"
+              .format(**rows[-1], mm=1000 * rows[-1]["read_error"]), flush=True)
     if os.path.isdir(run):
         lines = {row["distractors"]: [str(row[key]) if isinstance(row[key], int) else f"{row[key]:.4f}" for key in COLUMNS] for row in rows}
         if os.path.exists(path):                               # rows of other N stay

@@ -695,9 +695,10 @@ def test_checkpoint_evaluates_at_other_numbers_of_distractors(trained):
 
 
 def test_summary_of_four_episodes_by_hand():
-    row = evaluate.summary(5, [(1.0, 0.8, False, True, 0.1), (0.0, 0.0, True, False, 0.3), (0.9, 0.7, False, False, 0.1), (0.1, 0.1, False, False, 0.1)])
+    row = evaluate.summary(5, [(1.0, 0.8, False, True, 0.1, 0.0), (0.0, 0.0, True, False, 0.3, 0.0), (0.9, 0.7, False, False, 0.1, 0.0),
+                               (0.1, 0.1, False, False, 0.1, 0.1)])
     expected = {"distractors": 5, "episodes": 4, "success_aabb": 0.5, "success_strict": 0.4, "solved": 0.5, "cut_short": 1, "blocked": 0.25,
-                "success_clear": 1 / 3, "success_blocked": 1.0, "z_drift": 0.15, "ci95": 1.96 * math.sqrt(0.82 / 3) / 2,
+                "success_clear": 1 / 3, "success_blocked": 1.0, "z_drift": 0.15, "read_error": 0.025, "ci95": 1.96 * math.sqrt(0.82 / 3) / 2,
                 "ci95_strict": 1.96 * math.sqrt(0.5 / 3) / 2}                   # sums of squared deviations: 0.82 and 0.5
     assert row == pytest.approx(expected)
 
@@ -711,6 +712,7 @@ def test_blocked_ways_and_the_drift_of_z(trained):
         assert evaluate.is_blocked(obs) == blocks, (x, y)
     same, other = (np.array(rows, float) for rows in evaluate.play(trained, [0, 3], 0, 4, False).values())        # trained with 0
     assert (same[:, 4] == 0).all() and (other[:, 4] > 0.01).all() and (same[:, 3] == 0).all()
+    assert (same[:, 5] < 0.25).all() and same[:, 5].max() > 0.001              # m; the arena's radius is 0.24
 
 
 def test_table_puts_seeds_together(tmp_path, capsys):
