@@ -210,15 +210,14 @@ def plot(runs, path):
             left.fill_between(frames, np.min(smooth, 0), np.max(smooth, 0), color=color, alpha=0.15, linewidth=0)
             if evaluated(members):
                 cells = over_seeds(members, key)
-                right.errorbar(list(cells), *zip(*cells.values()), linestyle=style, marker="o", markersize=3, capsize=3, color=color,
-                               label=name if style == "-" else None)
+                right.errorbar(list(cells), *zip(*cells.values()), linestyle=style, marker="o", markersize=3, capsize=3, color=color)
     left.set(xlabel="million frames", ylabel="fractional success, last step", title=f"training (mean of {window} updates)")
     right.set(xlabel="distractors at test time", title="zero-shot (solid: axis-aligned, dotted: strict)")
+    right.xaxis.get_major_locator().set_params(integer=True)
     for axes in (left, right):
         axes.set_ylim(0, 1)
         axes.grid(alpha=0.3)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend()
+    left.legend()
     figure.savefig(path, dpi=120)
     print(f"wrote {path}")
 

@@ -772,7 +772,7 @@ def test_stopped_killed_and_resumed_equals_never_stopped(ranks, tmp_path):
     being written, each time followed by --resume: bit-equal weights and byte-equal progress.csv in the end."""
     kills, rng, cut, seen, inside, slowest = 20 if SLOW else 1, np.random.default_rng(ranks), tmp_path / "cut", 0, 0, 0.0
     command = ["train.py", "--distractors", "1", "--ranks", str(ranks), "--save-minutes", "0", "--frames", str(200 * (8 + 8 * kills)), *SMALL]
-    assert run(*command, "--out", str(tmp_path / "whole")).returncode == 0
+    assert run(*command, "--out", str(tmp_path / "whole"), timeout=900).returncode == 0
     for number in range(kills + 1):
         process = subprocess.Popen([sys.executable, *command, "--out", str(cut), *(["--resume"] if number else [])], cwd=HERE,
                                    stdout=subprocess.PIPE, text=True, start_new_session=True)
@@ -804,7 +804,7 @@ def test_stopped_killed_and_resumed_equals_never_stopped(ranks, tmp_path):
         kept = train.load(str(cut))[0]["update"]
         assert kept >= seen - 1                                # a checkpoint follows every update here
     print(f"\n{ranks} ranks: stopped in {slowest:.1f} s; {kills} kills, {inside} inside the writing, the last at update {kept}")
-    assert run(*command, "--out", str(cut), "--resume").returncode == 0
+    assert run(*command, "--out", str(cut), "--resume", timeout=900).returncode == 0
     whole, ours = (torch.load(folder / "checkpoint.pt", weights_only=True) for folder in (tmp_path / "whole", cut))
     assert whole["update"] == ours["update"] == 8 + 8 * kills and not os.path.exists(cut / "zeroshot.csv")
     assert all(torch.equal(value, ours["learner"][key]) for key, value in whole["learner"].items())
