@@ -1,7 +1,7 @@
 """Tests of everything, each against something independent: a slow loop, torch's own layer, PyBullet, a hand-computed case.
 
 Run:    pytest -q                                        under 3 minutes on 2 cores
-        SLOW=1 pytest -q -s -k "soak or killed_and or mutation"     12 M environment steps, 40 kills, one mutation per module: 2 hours
+        SLOW=1 pytest -q -s -k "soak or killed_and or mutation"     12 M environment steps, 40 kills, a dozen mutations: 1 to 2 hours
 """
 import ast
 import csv
@@ -925,7 +925,7 @@ def test_bad_input_ends_with_one_line_and_status_2(bad, capsys, monkeypatch):
             (train if command.startswith("train.py") else evaluate).main()
         error = [line for line in capsys.readouterr().err.splitlines() if "pybullet build time" not in line]
         assert stop.value.code == 2 and len(error) == 1 and any(w in error[0] for w in words.split("|")), (command, stop.value.code, error)
-    assert len(cases) > 60 and not os.path.exists("new") and not os.path.exists("evil")
+    print(len(cases), "cases of bad input"); assert len(cases) > 60 and not os.path.exists("new") and not os.path.exists("evil")
     for path, content in kept.items():
         assert open(path, "rb").read() == content, path
     done = run(os.path.join(HERE, "train.py"), "--encoder", "gnn")             # and once as a user sees it
