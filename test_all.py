@@ -744,6 +744,12 @@ def test_other_encoders_train_and_the_mlp_says_why_it_cannot_change_n(kind, tmp_
     assert done.returncode == 0, done.stderr
     assert ("fixed input" in done.stdout) == (kind == "mlp")
     assert len(evaluate.read(str(tmp_path / "run"), "zeroshot.csv")["episodes"]) == (1 if kind == "mlp" else 2)
+    agent, obs = train.load(str(tmp_path / "run"))[1], {"cubes": torch.zeros(1, 3, 18), "fingers": torch.zeros(1, 3, 10), "goal": torch.zeros(1, 12)}
+    if kind == "mlp":
+        with pytest.raises(ValueError, match="trained with 1 distractors and cannot be used with 2"):
+            agent(obs)
+    else:
+        assert agent(obs)[0].shape == (1, 9)
 
 
 def alive(group):
