@@ -372,27 +372,26 @@ class TriFingerEnv:
 
     def _read(self):
         """Read joints and cubes from the simulator. Returns a reason to cut the episode short, or None."""
-        c, reason = self._client, None
+        c, reason, flat, self._poses = self._client, None, [], []
         self._q, self._dq, _, _ = zip(*pb.getJointStates(self._robot, JOINTS, c))
-        self._poses = [pb.getBasePositionAndOrientation(cube, c) for cube in self._cubes]
-        self._velocities = [pb.getBaseVelocity(cube, c) for cube in self._cubes]
-        for ((x, y, z), turn), (linear, angular) in zip(self._poses, self._velocities):
-            if not math.isfinite(x + y + z + sum(turn) + sum(linear) + sum(angular)):
-                return "the physics diverged"
+        for cube, identifier in zip(self._cubes, self._ids):
+            (x, y, z), turn = pose = pb.getBasePositionAndOrientation(cube, c)
+            linear, angular = pb.getBaseVelocity(cube, c)
+            self._poses.append(pose)
+            if turn[3] < 0:                                    # q and -q are the same turn: show one of them
+                turn = (-turn[0], -turn[1], -turn[2], -turn[3])
+            flat += (1.0, CUBE, CUBE, CUBE, x, y, z, *turn, *linear, *angular, identifier)
             if not (x * x + y * y < (WALL + 0.03) ** 2 and -0.03 < z < 1.0):
                 reason = "a cube left the arena"
+        self._rows = flat
         # rad/s; full speed of all joints is about 80. Written so that NaN fails it.
-        return reason if sum(map(abs, self._dq)) < 1000 else "the physics diverged"
+        return reason if math.isfinite(sum(flat)) and sum(map(abs, self._dq)) < 1000 else "the physics diverged"
 
     def _observe(self):
         """The observation of Table 1 from what _read() read, scaled, in fresh arrays; also tips and rho."""
-        split, flat, q, dq = 18 * len(self._cubes), [], self._q, self._dq
-        for (position, turn), velocity, identifier in zip(self._poses, self._velocities, self._ids):
-            if turn[3] < 0:                                    # q and -q are the same turn: show one of them
-                turn = (-turn[0], -turn[1], -turn[2], -turn[3])
-            flat += (1.0, CUBE, CUBE, CUBE, *position, *turn, *velocity[0], *velocity[1], identifier)
+        split, q, dq = len(self._rows), self._q, self._dq
         self._tips = a, b, d = [forward_kinematics(k, q[3 * k:3 * k + 3]) for k in range(3)]
-        flat += (*q[:3], *dq[:3], -1.0, *a, *q[3:6], *dq[3:6], 0.0, *b, *q[6:], *dq[6:], 1.0, *d, *self._goal_row)
+        flat = (*self._rows, *q[:3], *dq[:3], -1.0, *a, *q[3:6], *dq[3:6], 0.0, *b, *q[6:], *dq[6:], 1.0, *d, *self._goal_row)
         flat = np.array(flat, np.float32) * self._scale
         self._rho = aabb_overlap(self._poses[self.target], self.goal)
         self._seen = {"cubes": flat[:split].reshape(-1, 18), "fingers": flat[split:-12].reshape(3, 10), "goal": flat[-12:]}
