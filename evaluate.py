@@ -31,10 +31,15 @@ def episode_seed(episode):
     return int(np.random.SeedSequence((20220131, episode)).generate_state(1)[0])
 
 
+def is_target(obs):
+    """(N+1,) bool: which cube does the goal name?"""
+    return obs["cubes"][:, -1] == obs["goal"][-1]
+
+
 def is_blocked(obs):
     """Does a distractor's centre lie within a cube's width of the straight line from the target to the goal?"""
     here, goal = obs["cubes"][:, 4:6] * CUBE_SCALE[4], obs["goal"][4:6] * CUBE_SCALE[4]        # m
-    target = obs["cubes"][:, -1] == obs["goal"][-1]
+    target = is_target(obs)
     start, others = here[target][0], here[~target]                             # (2,), (N, 2)
     share = np.clip((others - start) @ (goal - start) / max(np.square(goal - start).sum(), 1e-12), 0, 1)
     return bool((np.linalg.norm(others - start - share[:, None] * (goal - start), axis=1) < CUBE).any())
@@ -62,10 +67,11 @@ def play(path, numbers, first, count, mean_actions):
     trained, _, z_trained = start(checkpoint["distractors"])
     for env in trained:
         env.close()
+    spread = torch.cdist(z_trained, z_trained).sum() / max(count * (count - 1), 1)
     for n in numbers:
         envs, observations, z = start(n)
-        drift = (z - z_trained).norm(dim=1) / (torch.cdist(z_trained, z_trained).sum() / max(count * (count - 1), 1))
-        targets = torch.from_numpy(np.stack([obs["cubes"][obs["cubes"][:, -1] == obs["goal"][-1]][0, 4:7] for obs in observations]))
+        drift = (z - z_trained).norm(dim=1) / spread
+        targets = torch.from_numpy(np.stack([obs["cubes"][is_target(obs)][0, 4:7] for obs in observations]))
         miss = np.nan * z[:, 0] if not checkpoint["settings"]["auxiliary"] else (agent.read_out(z)[:, :3] - targets).norm(dim=1) * CUBE_SCALE[4]
         blocked, rows = [is_blocked(obs) for obs in observations], [None] * count
         noise = [np.random.default_rng(seed) for seed in seeds]
