@@ -190,7 +190,7 @@ def table(runs):
     print("|---" * (5 + len(numbers)) + "|")
     for (name, key), cells in columns.items():
         frames, seconds = ([read(run, "timing.csv")[column][-1] for run in groups[name]] for column in ("frames", "seconds"))
-        print(f"| {name} | {len(groups[name])} | {np.mean(frames) / 1e6:.1f} | {np.mean(seconds) / 60:.0f} | "
+        print(f"| {name} | {len(groups[name])} | {np.mean(frames) / 1e6:.1f} | {', '.join(f'{s / 60:.0f}' for s in seconds)} | "
               f"{dict(success_aabb='axis-aligned', success_strict='strict', solved='solved')[key]} | "
               + " | ".join(f"{cells[n][0]:.2f} ± {cells[n][1]:.2f}" if n in cells else "-" for n in numbers) + " |")
 

@@ -721,10 +721,10 @@ def test_table_puts_seeds_together(tmp_path, capsys):
         os.mkdir(tmp_path / name)
         line = dict.fromkeys(evaluate.COLUMNS, 0.0) | {"distractors": 2, "episodes": 100, "success_aabb": score, "ci95": 0.03, "solved": score}
         (tmp_path / name / "zeroshot.csv").write_text(",".join(line) + "\n" + ",".join(map(str, line.values())) + "\n")
-        (tmp_path / name / "timing.csv").write_text("frames,seconds\n6000000,1800\n")
+        (tmp_path / name / "timing.csv").write_text(f"frames,seconds\n6000000,{1800 + 60 * int(name[-1])}\n")
     evaluate.table([str(tmp_path / name) for name in rows])
     text = capsys.readouterr().out
-    assert "| push-lrn-n2 | 3 | 6.0 | 30 | axis-aligned | 0.80 ± 0.25 |" in text       # 4.303 * 0.1 / sqrt(3), t with 2 degrees of freedom
+    assert "| push-lrn-n2 | 3 | 6.0 | 30, 31, 32 | axis-aligned | 0.80 ± 0.25 |" in text       # 4.303 * 0.1 / sqrt(3), t with 2 degrees of freedom
     assert "| push-mlp-n2 | 1 | 6.0 | 30 | axis-aligned | 0.50 ± 0.03 |" in text
     assert "| push-mlp-n2 | 1 | 6.0 | 30 | solved | 0.50 ± 0.10 |" in text             # 1.96 * sqrt(0.5 * 0.5 / 100)
 
