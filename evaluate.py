@@ -161,21 +161,21 @@ def evaluated(members):
 
 
 def over_seeds(runs, key):
-    """{N: (mean, half width)} of a column of the runs' zeroshot.csv: a 95 % interval over the episodes of one run, or,
-    with several, over the seeds (Student's t, which is wide for few)."""
+    """{N: (values, bar, half)} of a column of the runs' zeroshot.csv: each run's mean (S,), the half width of the 95 % interval of
+    their mean over the episodes of these runs, and that over seeds (Student's t, wide for few; one run: over its episodes)."""
     cells, result = {}, {}
     for run in runs:
         rows = read(run, "zeroshot.csv")
         for i, n in enumerate(rows["distractors"]):
             share = rows["solved"][i]
-            half = {"success_aabb": rows["ci95"][i], "success_strict": rows["ci95_strict"][i],
-                    "solved": 1.96 * np.sqrt(share * (1 - share) / rows["episodes"][i])}[key]
-            cells.setdefault(int(n), []).append((rows[key][i], half))
+            bar = {"success_aabb": rows["ci95"][i], "success_strict": rows["ci95_strict"][i],
+                   "solved": 1.96 * np.sqrt(share * (1 - share) / rows["episodes"][i])}[key]
+            cells.setdefault(int(n), []).append((rows[key][i], bar))
     for n in sorted(cells):
-        values, half = np.array([value for value, _ in cells[n]]), cells[n][0][1]
-        if len(values) > 1:
-            half = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776}.get(len(values), 2.5) * values.std(ddof=1) / np.sqrt(len(values))
-        result[n] = values.mean(), half
+        values, bars = np.array(cells[n]).T
+        S, bar = len(values), np.sqrt(np.square(bars).sum()) / len(bars)
+        half = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776}.get(S, 2.5) * values.std(ddof=1) / np.sqrt(S) if S > 1 else bar
+        result[n] = values, bar, half
     return result
 
 
@@ -190,13 +190,16 @@ def table(runs):
     print("|---" * (5 + len(numbers)) + "|")
     for (name, key), cells in columns.items():
         frames, seconds = ([read(run, "timing.csv")[column][-1] for run in groups[name]] for column in ("frames", "seconds"))
+        shown = {n: f"{values.mean():.2f} ± {half:.2f}" + (f"<br>{', '.join(f'{x:.2f}' for x in values)}" if len(values) > 1 else "")
+                 for n, (values, _, half) in cells.items()}
         print(f"| {name} | {len(groups[name])} | {np.mean(frames) / 1e6:.1f} | {', '.join(f'{s / 60:.0f}' for s in seconds)} | "
               f"{dict(success_aabb='axis-aligned', success_strict='strict', solved='solved')[key]} | "
-              + " | ".join(f"{cells[n][0]:.2f} ± {cells[n][1]:.2f}" if n in cells else "-" for n in numbers) + " |")
+              + " | ".join(shown.get(n, "-") for n in numbers) + " |")
 
 
 def plot(runs, path):
-    """Training curves (left) and zero-shot curves (right, with 95 % intervals) of the runs, as in figure 3."""
+    """Training curves (left) and zero-shot curves (right, with 95 % intervals over episodes) of the runs, as in figure 3; a
+    band spans the seeds."""
     try:
         import matplotlib
     except ImportError:
@@ -216,7 +219,9 @@ def plot(runs, path):
             left.fill_between(frames, np.min(smooth, 0), np.max(smooth, 0), color=color, alpha=0.15, linewidth=0)
             if evaluated(members):
                 cells = over_seeds(members, key)
-                right.errorbar(list(cells), *zip(*cells.values()), linestyle=style, marker="o", markersize=3, capsize=3, color=color)
+                values, bars, _ = zip(*cells.values())
+                right.errorbar(list(cells), [x.mean() for x in values], bars, linestyle=style, marker="o", markersize=3, capsize=3, color=color)
+                right.fill_between(list(cells), [x.min() for x in values], [x.max() for x in values], color=color, alpha=0.15, linewidth=0)
     left.set(xlabel="million frames", ylabel="fractional success, last step", title=f"training (mean of {window} updates)")
     right.set(xlabel="distractors at test time", title="zero-shot (solid: axis-aligned, dotted: strict)")
     right.xaxis.get_major_locator().set_params(integer=True)
