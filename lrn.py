@@ -3,7 +3,8 @@
     z = LayerNorm(f_phi(sum_{i=1..K} g_theta(o_i, o_g)))
 
 One relation r_i = g_theta(o_i, o_g) per object with the goal, so the cost is linear in K; the sum makes z independent of
-the objects' order, and the normalisation keeps z in distribution when K changes.
+the objects' order, and the normalisation keeps z in distribution when K changes. Ours, not the paper's: aggregate="max" takes
+the largest r_i in each dimension in place of the sum; relations that are alike then count once, however many there are.
 
 Shapes: objects (B, K, D), goal (B, D), present (B, K) bool -> z (B, Z). B batch, K objects, D token width, Z width of z.
 Run:    python lrn.py
@@ -29,10 +30,14 @@ class LRN(nn.Module):
     token_dim, z_dim   D and Z (the paper: Z = 25)
     relations          False: the ablation without relations, g_theta(o_i) alone (figure 5, purple)
     layer_norm         False: the ablation z = f_phi(mean_i r_i) (figure 5, orange)
+    aggregate          "sum" (the paper) or "max" (ours; needs a real object in every row). ValueError for anything else.
     """
 
-    def __init__(self, token_dim=64, z_dim=25, relations=True, layer_norm=True):
+    def __init__(self, token_dim=64, z_dim=25, relations=True, layer_norm=True, aggregate="sum"):
         super().__init__()
+        if aggregate not in ("sum", "max") or aggregate == "max" and not layer_norm:
+            raise ValueError(f"aggregate must be 'sum' or, with layer_norm, 'max', got {aggregate!r}")
+        self.aggregate = aggregate
         D = token_dim
         self.first = orthogonal(nn.Linear(2 * D if relations else D, D))       # first of the four layers of g_theta
         self.g = nn.Sequential(nn.ReLU(), orthogonal(nn.Linear(D, D)), nn.ReLU(), orthogonal(nn.Linear(D, D)), nn.ReLU(),
@@ -53,8 +58,8 @@ class LRN(nn.Module):
         """z (B, Z) of objects (B, K, D) and goal (B, D). `present` (B, K) bool: False marks padding, ignored exactly."""
         r = self.relations(objects, goal)                      # (B, K, D)
         if present is not None:
-            r = r.masked_fill(~present[..., None], 0.0)
-        total = r.sum(1)                                       # (B, D)
+            r = r.masked_fill(~present[..., None], 0.0 if self.aggregate == "sum" else -math.inf)
+        total = r.sum(1) if self.aggregate == "sum" else r.amax(1)     # (B, D)
         if self.norm is not None:
             return self.norm(self.f(total))                    # (B, Z)
         count = objects.shape[1] if present is None else present.sum(1, keepdim=True).clamp(min=1)

@@ -59,6 +59,22 @@ def test_lrn_equals_the_loop_over_objects():
         torch.testing.assert_close(encoder(objects, goal)[b], z, atol=1e-5, rtol=1e-4)
 
 
+def test_lrn_with_a_maximum_equals_the_loop_and_counts_copies_once():
+    encoder, (objects, goal) = LRN(aggregate="max"), some(3, 6)
+    for b in range(3):
+        r = [g_slow(encoder, torch.cat([objects[b, i], goal[b]])) for i in range(6)]
+        largest = torch.stack([max(column) for column in zip(*r)])
+        z = nn.functional.layer_norm(largest @ encoder.f.weight.T + encoder.f.bias, (25,))
+        torch.testing.assert_close(encoder(objects, goal)[b], z, atol=1e-5, rtol=1e-4)
+    more = torch.cat([objects, objects[:, 2:3].expand(-1, 7, -1)], 1)                      # seven copies of object 2
+    torch.testing.assert_close(encoder(more, goal), encoder(objects, goal), atol=1e-5, rtol=1e-4)
+    summed = LRN()
+    assert (summed(more, goal) - summed(objects, goal)).abs().max() > 0.1
+    for wrong in ({"aggregate": "mean"}, {"aggregate": "max", "layer_norm": False}):
+        with pytest.raises(ValueError, match="aggregate"):
+            LRN(**wrong)
+
+
 def test_rn_equals_the_double_loop_over_pairs():
     encoder, (objects, goal) = RN(), some(2, 5)
     for b in range(2):
@@ -97,7 +113,7 @@ def test_ablations_of_lrn_equal_their_formulas():
     assert mean(objects, goal).shape == (2, 10)
 
 
-@pytest.mark.parametrize("make", [LRN, RN, ATTN, lambda: LRN(layer_norm=False), lambda: LRN(relations=False)])
+@pytest.mark.parametrize("make", [LRN, RN, ATTN, lambda: LRN(layer_norm=False), lambda: LRN(relations=False), lambda: LRN(aggregate="max")])
 def test_encoder_ignores_order_and_padding_and_serves_any_number(make):
     encoder, other = make(), make()
     other.load_state_dict(encoder.state_dict())
@@ -111,7 +127,7 @@ def test_encoder_ignores_order_and_padding_and_serves_any_number(make):
         torch.testing.assert_close(z, encoder(padded, goal, present), atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("make", [LRN, RN, ATTN])
+@pytest.mark.parametrize("make", [LRN, RN, ATTN, lambda: LRN(aggregate="max")])
 def test_gradient_reaches_every_parameter(make):
     encoder, (objects, goal) = make(), some(8, 6)
     (encoder(objects, goal) * torch.randn(8, 25)).sum().backward()
@@ -130,7 +146,7 @@ def test_relations_grow_linearly_in_lrn_and_quadratically_in_rn():
             assert rows[-1] == count
 
 
-@pytest.mark.parametrize("kind", ["lrn", "rn", "attn"])
+@pytest.mark.parametrize("kind", ["lrn", "lrn-max", "rn", "attn"])
 def test_z_varies_with_the_state_from_the_start(kind):
     """PyTorch's default initialisation gives LRN and RN a z that is nearly constant over states; ours must not."""
     torch.manual_seed(0)
@@ -738,7 +754,7 @@ def test_plot_and_film(trained, tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 10_000 and (tmp_path / "a.gif").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("kind", ["rn", "attn", "mlp"])
+@pytest.mark.parametrize("kind", ["lrn-max", "rn", "attn", "mlp"])
 def test_other_encoders_train_and_the_mlp_says_why_it_cannot_change_n(kind, tmp_path):
     done = run("train.py", "--encoder", kind, "--distractors", "1", "--ranks", "1", "--frames", "200", "--out", str(tmp_path / "run"), *SMALL)
     assert done.returncode == 0, done.stderr
@@ -747,6 +763,7 @@ def test_other_encoders_train_and_the_mlp_says_why_it_cannot_change_n(kind, tmp_
     assert ("fixed input" in done.stdout) == (kind == "mlp")
     assert len(evaluate.read(str(tmp_path / "run"), "zeroshot.csv")["episodes"]) == (1 if kind == "mlp" else 2)
     agent, obs = train.load(str(tmp_path / "run"))[1], {"cubes": torch.zeros(1, 3, 18), "fingers": torch.zeros(1, 3, 10), "goal": torch.zeros(1, 12)}
+    assert getattr(agent.encoder, "aggregate", None) == ("max" if kind == "lrn-max" else None)
     if kind == "mlp":
         with pytest.raises(ValueError, match="trained with 1 distractors and cannot be used with 2"):
             agent(obs)

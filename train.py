@@ -33,7 +33,7 @@ from rn import RN
 from trifinger_env import IDENTIFIERS, TriFingerEnv
 
 POOL = torch.tensor(IDENTIFIERS, dtype=torch.float32)
-ENCODERS = ("lrn", "rn", "attn", "mlp")
+ENCODERS = ("lrn", "lrn-max", "rn", "attn", "mlp")
 #                          default, paper      why they differ (paper: A.2 = printed; CW = not printed, from CausalWorld's script)
 SETTINGS = {
     "frames":               (6_000_000, 60_000_000, "environment steps in all; the paper prints no number, CW trains 60 M"),
@@ -104,8 +104,8 @@ class Agent(nn.Module):
             self.encoder = nn.Sequential(mlp(18 * (distractors + 1) + 30 + 12, 2 * H, 2 * H, Z), nn.LayerNorm(Z))
         else:
             self.cube, self.finger, self.goal = mlp(18, H, D), mlp(10, H, D), mlp(12, H, D)
-            self.encoder = (LRN(D, Z, settings["relations"], settings["layer_norm"]) if encoder == "lrn" else
-                            RN(D, Z) if encoder == "rn" else ATTN(D, Z, settings["heads"]))
+            self.encoder = (RN(D, Z) if encoder == "rn" else ATTN(D, Z, settings["heads"]) if encoder == "attn" else
+                            LRN(D, Z, settings["relations"], settings["layer_norm"], "max" if encoder == "lrn-max" else "sum"))
         self.policy, self.value, self.read_out = mlp(Z, H, H, 9, last_gain=0.01), mlp(Z, H, H, 1, last_gain=1.0), mlp(Z, H, 18)
         self.log_std = nn.Parameter(torch.full((9,), settings["log_std"]))
 
@@ -290,7 +290,7 @@ def parse(argv=None):
     """Check everything that can be wrong before any process starts. Returns (args, settings)."""
     parser = argparse.ArgumentParser(description="Train an agent with PPO (see the first lines of train.py).")
     parser.error = fail
-    parser.add_argument("--encoder", choices=ENCODERS, default="lrn", help="object encoder (default lrn)")
+    parser.add_argument("--encoder", choices=ENCODERS, default="lrn", help="object encoder; lrn-max is LRN with a maximum in place of the sum (default lrn)")
     parser.add_argument("--task", choices=("push", "lift"), default="push", help="PushingCube or LiftingCube (default push)")
     parser.add_argument("--distractors", type=int, default=2, metavar="N", help="cubes besides the target (default 2)")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="fixes every random number of the run (default 0)")
