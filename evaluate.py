@@ -207,7 +207,7 @@ def plot(runs, path):
         raise ValueError("--plot needs matplotlib: pip install matplotlib") from None
     matplotlib.use("Agg")
     from matplotlib import pyplot
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
     for name, members in by_seed(runs).items():
         progress = [read(run, "progress.csv") for run in members]
         count = min(len(rows["frames"]) for rows in progress)
@@ -229,7 +229,7 @@ def plot(runs, path):
     for axes in (left, right):
         axes.set_ylim(0, 1)
         axes.grid(alpha=0.3)
-    left.legend()
+    figure.legend(loc="outside lower center", ncols=4)
     figure.savefig(path, dpi=120)
     print(f"wrote {path}")
 
