@@ -184,17 +184,19 @@ def table(runs):
     groups = {name: members for name, members in by_seed(runs).items() if evaluated(members)}
     if not groups:
         return print("no zeroshot.csv in these runs yet: evaluate them with --episodes 200 first")
+    costs = {}
+    for name, members in groups.items():
+        frames, seconds = ([read(run, "timing.csv")[column][-1] for run in members] for column in ("frames", "seconds"))
+        costs[name] = f"| {name} | {len(members)} | {np.mean(frames) / 1e6:.1f} | {', '.join(f'{s / 60:.0f}' for s in seconds)} | "
     for key, title in (("success_aabb", "axis-aligned"), ("success_strict", "strict"), ("solved", "solved")):
         columns = {name: over_seeds(members, key) for name, members in groups.items()}
         numbers = sorted({n for cells in columns.values() for n in cells})
         print(f"| {title} | seeds | million frames | minutes | " + " | ".join(f"N = {n}" for n in numbers) + " |")
         print("|---" * (4 + len(numbers)) + "|")
         for name, cells in columns.items():
-            frames, seconds = ([read(run, "timing.csv")[column][-1] for run in groups[name]] for column in ("frames", "seconds"))
             shown = {n: f"{values.mean():.2f} ± {half:.2f}" + (f"<br>{', '.join(f'{x:.2f}' for x in values)}" if len(values) > 1 else "")
                      for n, (values, _, half) in cells.items()}
-            print(f"| {name} | {len(groups[name])} | {np.mean(frames) / 1e6:.1f} | {', '.join(f'{s / 60:.0f}' for s in seconds)} | "
-                  + " | ".join(shown.get(n, "-") for n in numbers) + " |")
+            print(costs[name] + " | ".join(shown.get(n, "-") for n in numbers) + " |")
         print()
 
 
