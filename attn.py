@@ -1,10 +1,13 @@
 """Self-attention encoder: the paper's baseline (appendix A.4, figure 2 box A).
 
-    o_attn = softmax(q(o) k(o)^T / sqrt(d)) v(o)        z = LayerNorm(f_phi(sum_{i=1..K+1} o_attn_i))
+    o_attn = softmax(q(o) k(o)^T / sqrt(d)) v(o)
+    z = LayerNorm(f_phi(sum_{i=1..K+1} o_attn_i))
 
-The goal joins the K objects as token K+1, and every token attends to every token: (K+1)^2 weights per head.
+The goal joins the K objects as token K+1, and every token attends to every token: (K+1)^2 weights
+per head. As in the paper's equations there is no output projection and no residual.
 
-Shapes: objects (B, K, D), goal (B, D), present (B, K) bool -> z (B, Z). B batch, K objects, D token width, Z width of z,
+Shapes: objects (B, K, D), goal (B, D), present (B, K) bool -> z (B, Z).
+        B batch, K objects, D token width (the paper's d), Z width of z (its d_z),
         H heads, d = D / H width of a head.
 Run:    python attn.py
 """
@@ -15,55 +18,98 @@ from torch import nn
 
 
 def orthogonal(layer, gain=math.sqrt(2)):
-    """Orthogonal weights, zero bias. PyTorch's default shrinks the signal layer by layer, and z starts out constant."""
+    """Set orthogonal weights and a zero bias; returns the layer.
+
+    PyTorch's default shrinks the signal layer by layer, and z would start out nearly the same for
+    every input. (Copied in lrn.py, rn.py and attn.py: each file stands alone.)
+    """
     nn.init.orthogonal_(layer.weight, gain)
-    if layer.bias is not None:
-        nn.init.zeros_(layer.bias)
+    nn.init.zeros_(layer.bias)
     return layer
 
 
-class ATTN(nn.Module):
-    """Encoder of equations 3 and 4 (appendix A.4) with `heads` heads; nothing in it depends on K.
+def check_shapes(D, objects, goal, present=None):
+    """ValueError unless objects is (B, K, D), goal (B, D) and present, if given, (B, K) bool."""
+    if objects.ndim != 3 or objects.shape[2] != D:
+        raise ValueError(f"objects must be (B, K, D={D}), got {tuple(objects.shape)}")
+    B, K, _ = objects.shape
+    if goal.shape != (B, D):
+        raise ValueError(f"goal must be (B, D) = {(B, D)}, got {tuple(goal.shape)}")
+    if present is not None and (present.shape != (B, K) or present.dtype != torch.bool):
+        got = f"{tuple(present.shape)} {present.dtype}"
+        raise ValueError(f"present must be (B, K) = {(B, K)} of torch.bool, got {got}")
 
-    token_dim, z_dim   D and Z. ValueError unless D is a multiple of `heads` (the paper does not print their number).
+
+class ATTN(nn.Module):
+    """Encoder of appendix A.4 with `heads` heads; nothing in it depends on K.
+
+    token_dim   D. ValueError unless it is a multiple of `heads`.
+    z_dim       Z
+    heads       H; the paper does not print it
     """
 
     def __init__(self, token_dim=64, z_dim=25, heads=4):
         super().__init__()
         if heads < 1 or token_dim % heads:
             raise ValueError(f"token_dim must be a multiple of heads, got {token_dim} and {heads}")
+        D, Z = token_dim, z_dim
+        self.token_dim = D
         self.heads = heads
-        self.q, self.k, self.v = (orthogonal(nn.Linear(token_dim, token_dim)) for _ in range(3))
-        self.f = orthogonal(nn.Linear(token_dim, z_dim))
-        self.norm = nn.LayerNorm(z_dim)
+        self.q = orthogonal(nn.Linear(D, D))
+        self.k = orthogonal(nn.Linear(D, D))
+        self.v = orthogonal(nn.Linear(D, D))
+        self.f = orthogonal(nn.Linear(D, Z))
+        self.norm = nn.LayerNorm(Z)
+
+    def split_heads(self, x):
+        """(B, K+1, D) -> (B, H, K+1, d)."""
+        B, count, D = x.shape
+        return x.view(B, count, self.heads, D // self.heads).transpose(1, 2)
 
     def attend(self, objects, goal, present=None):
-        """Attended tokens (B, K+1, D) and attention weights (B, H, K+1, K+1): row i is what token i looks at."""
-        tokens = torch.cat([objects, goal[:, None]], 1)                                        # (B, K+1, D)
-        B, T, D = tokens.shape
-        q, k, v = (layer(tokens).view(B, T, self.heads, D // self.heads).transpose(1, 2)       # (B, H, K+1, d)
-                   for layer in (self.q, self.k, self.v))
-        score = q @ k.transpose(2, 3) / math.sqrt(D // self.heads)                             # (B, H, K+1, K+1)
+        """Attended tokens (B, K+1, D) and attention weights (B, H, K+1, K+1).
+
+        Row i of the weights says what token i looks at; padding is never looked at.
+        """
+        check_shapes(self.token_dim, objects, goal, present)
+        tokens = torch.cat([objects, goal[:, None]], dim=1)    # (B, K+1, D)
+        q = self.split_heads(self.q(tokens))                   # (B, H, K+1, d)
+        k = self.split_heads(self.k(tokens))                   # (B, H, K+1, d)
+        v = self.split_heads(self.v(tokens))                   # (B, H, K+1, d)
+
+        # softmax(q k^T / sqrt(d)) v
+        score = q @ k.transpose(2, 3) / math.sqrt(q.shape[-1])             # (B, H, K+1, K+1)
         if present is not None:
-            real = torch.cat([present, present.new_ones(B, 1)], 1)                             # (B, K+1), the goal is real
+            goal_is_real = present.new_ones(len(present), 1)   # (B, 1) bool
+            real = torch.cat([present, goal_is_real], dim=1)   # (B, K+1)
             score = score.masked_fill(~real[:, None, None], -math.inf)
-        weights = score.softmax(-1)
-        return (weights @ v).transpose(1, 2).reshape(B, T, D), weights
+        weights = score.softmax(dim=-1)                        # (B, H, K+1, K+1)
+        per_head = weights @ v                                 # (B, H, K+1, d)
+        attended = per_head.transpose(1, 2).reshape(tokens.shape)          # (B, K+1, D), joined
+        return attended, weights
 
     def forward(self, objects, goal, present=None):
-        """z (B, Z) of objects (B, K, D) and goal (B, D). `present` (B, K) bool: False marks padding, ignored exactly."""
-        attended, _ = self.attend(objects, goal, present)                                      # (B, K+1, D)
-        if present is not None:
-            attended = torch.cat([attended[:, :-1].masked_fill(~present[..., None], 0.0), attended[:, -1:]], 1)
-        return self.norm(self.f(attended.sum(1)))                                              # (B, Z)
+        """Second equation of A.4: objects (B, K, D), goal (B, D) -> z (B, Z).
+
+        `present` (B, K) bool is for batches that mix numbers of objects (training has one K a
+        batch): False marks padding, and z is as if it were not there. ValueError for other shapes.
+        """
+        attended, _ = self.attend(objects, goal, present)      # (B, K+1, D)
+        if present is not None:                                # padding looked at others: drop it
+            of_objects = attended[:, :-1].masked_fill(~present[..., None], 0.0)
+            attended = torch.cat([of_objects, attended[:, -1:]], dim=1)
+        total = attended.sum(dim=1)                            # (B, D), sum_i o_attn_i
+        return self.norm(self.f(total))                        # (B, Z), LayerNorm(f_phi(.))
 
 
 if __name__ == "__main__":
     torch.manual_seed(0)
     encoder = ATTN()
     for K in (4, 6, 12):
-        objects, goal, order = torch.randn(2, K, 64), torch.randn(2, 64), torch.randperm(K)
+        objects, goal = torch.randn(2, K, 64), torch.randn(2, 64)
         z = encoder(objects, goal)
-        gap = (z - encoder(objects[:, order], goal)).abs().max()
-        print(f"K={K:2d} objects: attention weights {tuple(encoder.attend(objects, goal)[1].shape)}, z {tuple(z.shape)}, "
-              f"largest change when the objects are permuted: {gap:.1e}")
+        shuffled = encoder(objects[:, torch.randperm(K)], goal)
+        _, weights = encoder.attend(objects, goal)
+        change = (z - shuffled).abs().max()
+        print(f"K={K:2d} objects: attention weights {tuple(weights.shape)}, z {tuple(z.shape)}, "
+              f"largest change when the objects are shuffled: {change:.1e}")

@@ -1,267 +1,329 @@
-"""Play trained agents zero-shot at other numbers of distractors and measure fractional success (section 4.3, figure 3 right).
+"""Play trained agents zero-shot at other numbers of distractors (section 4.3, figure 3 right).
 
-    python evaluate.py RUN [RUN ...] --distractors 0-9 --episodes 200      table, and zeroshot.csv in each run folder
-    python evaluate.py RUN --mean-actions                                  without sampling noise: zeroshot-mean.csv
-    python evaluate.py RUN [RUN ...] --episodes 0 --plot curves.png        README's table and curves, from the CSV files alone
-    python evaluate.py RUN --distractors 9 --episodes 0 --gif push.gif     a film of one episode
+    python evaluate.py RUN                                   N = 0..9, 200 episodes each: a table
+    python evaluate.py RUN [RUN ...] --distractors 0-9,14 --save       and RUN/zeroshot.csv
+    python evaluate.py RUN --mean-actions                    without sampling noise
+    python evaluate.py RUN --watch                           watch it play, live in a window
+    python evaluate.py RUN --gif push.gif --distractors 9    a film of one episode
 
-Episode j starts from the same seed at every N and for every agent: the goal and the target cube stand in the same places,
-only the distractors differ. The seeds belong to no training run.
+Episode j starts from the same seed at every N and for every agent: goal and target cube stand in
+the same places, only the distractors differ. The seeds belong to no training run.
 """
 import argparse
 import csv
 import multiprocessing
 import os
-import re
 import signal
+import time
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+import pybullet
 import torch
 
-from train import fail, load, make_env
-from trifinger_env import CUBE, CUBE_SCALE
+from train import derived_seed, fail, load, make_env
+from trifinger_env import CUBE, IDENTIFIER, POSITION, POSITION_SCALE, SOLVED
 
-COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict", "solved", "cut_short",
-           "blocked", "success_clear", "success_blocked", "z_drift", "read_error")
-CHUNK = 25                                # episodes played side by side; fixed, so that results do not depend on the cores
+COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict",
+           "solved", "cut_short", "blocked", "success_clear", "success_blocked", "z_drift",
+           "read_error")
+CHUNK = 25                               # episodes side by side; fixed, whatever the cores
+EVALUATION = 20220131                    # keeps these seeds apart from training's
+
+
+class Episode(NamedTuple):
+    """What one episode came to."""
+    rho: float                           # fractional success at the last step, axis-aligned
+    strict: float                        # the same by true volumes
+    cut_short: bool                      # ended for another reason than time
+    blocked: bool                        # a distractor stood in the way at the start
+    drift: float                         # of z at the start, see first_look()
+    read_error: float                    # m, see first_look()
 
 
 def episode_seed(episode):
-    """Seed of evaluation episode `episode`; the leading number keeps it apart from training's (seed, update, env)."""
-    return int(np.random.SeedSequence((20220131, episode)).generate_state(1)[0])
+    """Seed of evaluation episode `episode`."""
+    return derived_seed(EVALUATION, episode)
 
 
 def is_target(obs):
     """(N+1,) bool: which cube does the goal name?"""
-    return obs["cubes"][:, -1] == obs["goal"][-1]
+    return obs["cubes"][:, IDENTIFIER] == obs["goal"][IDENTIFIER]
 
 
 def is_blocked(obs):
-    """Does a distractor's centre lie within a cube's width of the straight line from the target to the goal?"""
-    here, goal = obs["cubes"][:, 4:6] * CUBE_SCALE[4], obs["goal"][4:6] * CUBE_SCALE[4]        # m
+    """Does a distractor's centre lie within a cube's width of the line from target to goal?"""
     target = is_target(obs)
-    start, others = here[target][0], here[~target]                             # (2,), (N, 2)
-    share = np.clip((others - start) @ (goal - start) / max(np.square(goal - start).sum(), 1e-12), 0, 1)
-    return bool((np.linalg.norm(others - start - share[:, None] * (goal - start), axis=1) < CUBE).any())
+    places = obs["cubes"][:, POSITION][:, :2] * POSITION_SCALE             # (N+1, 2), m
+    goal = obs["goal"][POSITION][:2] * POSITION_SCALE
+    start, others = places[target][0], places[~target]
+    way = goal - start
+    length_squared = max(np.square(way).sum(), 1e-12)
+    share = np.clip((others - start) @ way / length_squared, 0, 1)         # of the way, (N,)
+    nearest = start + share[:, None] * way                                 # (N, 2)
+    return bool((np.linalg.norm(others - nearest, axis=1) < CUBE).any())
+
+
+# ---- playing
+
+def as_batch(observations):
+    return {key: torch.from_numpy(np.stack([obs[key] for obs in observations]))
+            for key in observations[0]}
+
+
+def start(checkpoint, agent, distractors, seeds):
+    """Environments, their first observations and z (B, Z) of these."""
+    envs = [make_env(checkpoint["task"], distractors, checkpoint["settings"]) for _ in seeds]
+    observations = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds)]
+    return envs, observations, agent.encode(as_batch(observations))
+
+
+@lru_cache
+def trained_z(path, first, count):
+    """z (B, Z) at the start of these episodes at the N of training."""
+    checkpoint, agent = load(path)
+    seeds = [episode_seed(first + e) for e in range(count)]
+    envs, _, z = start(checkpoint, agent, checkpoint["distractors"], seeds)
+    for env in envs:
+        env.close()
+    return z
+
+
+def first_look(agent, observations, z, z_trained, has_read_out):
+    """Two measures of z at the start of B episodes, lists of B numbers each.
+
+    drift        distance from the z of the same episode at the training N, over the mean distance
+                 between different episodes there
+    read_error   distance (m) from the target cube to where the agent's read-out sees it; NaN if it
+                 was trained without one
+    """
+    B = len(observations)
+    spread = torch.cdist(z_trained, z_trained).sum() / max(B * (B - 1), 1)
+    drift = (z - z_trained).norm(dim=1) / spread
+    if not has_read_out:
+        return drift.tolist(), [float("nan")] * B
+    targets = np.stack([obs["cubes"][is_target(obs)][0, POSITION] for obs in observations])
+    seen = agent.read_out(z)[:, :3]
+    error = (seen - torch.from_numpy(targets)).norm(dim=1) * POSITION_SCALE
+    return drift.tolist(), error.tolist()
+
+
+def actions(agent, observations, noise, mean_actions):
+    """Actions (B, 9), sampled with one generator of `noise` per episode, or the policy's means."""
+    mean, log_std, _ = agent(as_batch(observations))
+    if mean_actions:
+        return mean.numpy()
+    std = log_std.exp().numpy()
+    return [m + std * generator.standard_normal(9) for m, generator in zip(mean.numpy(), noise)]
+
+
+def to_the_end(agent, envs, observations, seeds, mean_actions):
+    """Play every environment until its episode ends; the info of each last step."""
+    noise = [np.random.default_rng(seed) for seed in seeds]
+    ends = [None] * len(envs)
+    while None in ends:
+        for e, action in enumerate(actions(agent, observations, noise, mean_actions)):
+            if ends[e] is None:
+                observations[e], _, _, truncated, info = envs[e].step(action)
+                if truncated:
+                    ends[e] = info
+    return ends
 
 
 @torch.inference_mode()
-def play(path, numbers, first, count, mean_actions):
-    """Play episodes first .. first+count-1 of the agent in `path` at every N in `numbers`: {N: a row of six numbers each}.
-
-    rho, strict rho, was it cut short, was the way to the goal blocked at the start, and two measures of the first z: its
-    drift, the distance from the z of the same episode at the training N over the mean distance between different episodes
-    there; and how far from the target cube (m) the agent's read-out sees it (NaN if it was trained without one).
-    """
+def play(path, distractors, first, count, mean_actions):
+    """Play episodes first .. first+count-1 of the agent in `path`: a list of Episodes."""
     torch.set_num_threads(1)
-    (checkpoint, agent), seeds, results = load(path), [episode_seed(first + e) for e in range(count)], {}
-
-    def batch(observations):
-        return {key: torch.from_numpy(np.stack([obs[key] for obs in observations])) for key in observations[0]}
-
-    def start(n):
-        envs = [make_env(checkpoint["task"], n, checkpoint["settings"]) for _ in seeds]
-        observations = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds)]
-        return envs, observations, agent.encode(batch(observations))           # z (B, Z)
-
-    trained, _, z_trained = start(checkpoint["distractors"])
-    for env in trained:
+    checkpoint, agent = load(path)
+    seeds = [episode_seed(first + e) for e in range(count)]
+    envs, observations, z = start(checkpoint, agent, distractors, seeds)
+    has_read_out = checkpoint["settings"]["auxiliary"] > 0
+    z_trained = trained_z(path, first, count)
+    drift, read_error = first_look(agent, observations, z, z_trained, has_read_out)
+    blocked = [is_blocked(obs) for obs in observations]
+    ends = to_the_end(agent, envs, observations, seeds, mean_actions)
+    for env in envs:
         env.close()
-    spread = torch.cdist(z_trained, z_trained).sum() / max(count * (count - 1), 1)
-    for n in numbers:
-        envs, observations, z = start(n)
-        drift = (z - z_trained).norm(dim=1) / spread
-        targets = torch.from_numpy(np.stack([obs["cubes"][is_target(obs)][0, 4:7] for obs in observations]))
-        miss = np.nan * z[:, 0] if not checkpoint["settings"]["auxiliary"] else (agent.read_out(z)[:, :3] - targets).norm(dim=1) * CUBE_SCALE[4]
-        blocked, rows = [is_blocked(obs) for obs in observations], [None] * count
-        noise = [np.random.default_rng(seed) for seed in seeds]
-        while None in rows:
-            mean, log_std, _ = agent(batch(observations))
-            mean, std = mean.numpy(), log_std.exp().numpy()
-            for e, env in enumerate(envs):
-                if rows[e] is None:
-                    action = mean[e] if mean_actions else mean[e] + std * noise[e].standard_normal(9)
-                    observations[e], _, _, truncated, info = env.step(action)
-                    if truncated:
-                        rows[e] = (info["fractional_success"], info["fractional_success_strict"], info["truncated_by"] != "time",
-                                   blocked[e], drift[e].item(), miss[e].item())
-        for env in envs:
-            env.close()
-        results[n] = rows
-    return results
+    return [Episode(info["fractional_success"], info["fractional_success_strict"],
+                    info["truncated_by"] != "time", *rest)
+            for info, *rest in zip(ends, blocked, drift, read_error)]
 
 
-def summary(distractors, results):
-    """One row of zeroshot.csv; ci95 is the half width of the normal 95 % interval of the mean over episodes."""
-    values = np.array(results, float)                                          # (episodes, 6)
-    half = 1.96 * values.std(0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.full(6, np.nan)
-    mean, rho, blocked = values.mean(0), values[:, 0], values[:, 3] > 0
-    clear, behind = (rho[rows].mean() if rows.any() else np.nan for rows in (~blocked, blocked))
-    return dict(zip(COLUMNS, (distractors, len(values), mean[0], mean[1], half[0], half[1], (rho >= 0.8).mean(), int(values[:, 2].sum()),
-                              mean[3], clear, behind, mean[4], mean[5])))
+# ---- the sweep over N
+
+def half_width(values):
+    """Half width of the normal 95 % interval of a mean; NaN for a single value."""
+    if len(values) < 2:
+        return float("nan")
+    return 1.96 * values.std(ddof=1) / np.sqrt(len(values))
+
+
+def mean(values):
+    """Mean of an array; NaN, without a warning, if it is empty."""
+    return values.mean() if len(values) else float("nan")
+
+
+def summary(distractors, episodes):
+    """One row of zeroshot.csv: means over episodes, with 95 % intervals."""
+    rho, strict, cut_short, blocked, drift, read_error = np.array(episodes, float).T
+    is_clear = blocked == 0
+    return {
+        "distractors": distractors,
+        "episodes": len(episodes),
+        "success_aabb": rho.mean(),
+        "success_strict": strict.mean(),
+        "ci95": half_width(rho),
+        "ci95_strict": half_width(strict),
+        "solved": (rho >= SOLVED).mean(),
+        "cut_short": int(cut_short.sum()),
+        "blocked": blocked.mean(),
+        "success_clear": mean(rho[is_clear]),
+        "success_blocked": mean(rho[~is_clear]),
+        "z_drift": drift.mean(),
+        "read_error": read_error.mean(),
+    }
+
+
+HEADER = ("   N  success (axis-aligned)  success (strict)  solved  cut short   way clear  "
+          "way blocked (share)  drift of z  read error (mm)")
+
+
+def print_row(row, seconds_left):
+    aligned = f"{row['success_aabb']:.3f} +- {row['ci95']:.3f}"
+    strict = f"{row['success_strict']:.3f} +- {row['ci95_strict']:.3f}"
+    blocked = f"{row['success_blocked']:.3f} ({row['blocked']:.2f})"
+    left = f"about {seconds_left / 60:.1f} min left" if seconds_left else ""
+    print(f"{row['distractors']:4d} {aligned:>23s} {strict:>17s} {row['solved']:7.3f} "
+          f"{row['cut_short']:10d} {row['success_clear']:11.3f} {blocked:>20s} "
+          f"{row['z_drift']:11.3f} {1000 * row['read_error']:16.1f}  {left}", flush=True)
 
 
 def evaluate(run, distractors, episodes, mean_actions=False):
-    """Play `episodes` episodes at every N in `distractors` on all cores; prints, writes and returns the rows."""
+    """Play `episodes` episodes at every N in `distractors` on all cores.
+
+    Prints and returns rows, each as soon as its N is done.
+    """
     checkpoint, _ = load(run)
-    name = "zeroshot-mean.csv" if mean_actions else "zeroshot.csv"
-    path = os.path.join(run, name)
-    if os.path.exists(path) and tuple(read(run, name)) != COLUMNS:             # refused before the play, not after it
-        raise ValueError(f"{path} has other columns than this version writes: remove it first")
-    if checkpoint["encoder"] == "mlp" and any(n != checkpoint["distractors"] for n in distractors):
-        print(f"{run}: an mlp has a fixed input, so it can be played at its own N = {checkpoint['distractors']} only")
-        distractors = [n for n in distractors if n == checkpoint["distractors"]]
+    trained = checkpoint["distractors"]
+    if checkpoint["encoder"] == "mlp" and distractors != [trained]:
+        print(f"{run}: an mlp has a fixed input, so it can be played at its own N = {trained} only")
+        distractors = [n for n in distractors if n == trained]
     if not distractors:
         return []
-    chunks = [(run, distractors, first, min(CHUNK, episodes - first), mean_actions) for first in range(0, episodes, CHUNK)]
-    print(f"{run}: {checkpoint['encoder']} trained on {checkpoint['task']} with {checkpoint['distractors']} distractors, "
-          f"{checkpoint['frames']} frames, {'mean' if mean_actions else 'sampled'} actions")
-    print("   N  episodes  success (axis-aligned)  success (strict)  solved  cut short   way clear  way blocked (share)   drift of z   read error (mm)")
+    print(f"{run}: {checkpoint['encoder']} trained on {checkpoint['task']} with {trained} "
+          f"distractors, {checkpoint['frames']} frames; {episodes} episodes each, "
+          f"{'mean' if mean_actions else 'sampled'} actions")
+    print(HEADER, flush=True)
+    firsts = range(0, episodes, CHUNK)
+    chunks = [(run, n, first, min(CHUNK, episodes - first), mean_actions)
+              for n in distractors for first in firsts]
     # Ctrl-C is for the main process alone: leaving the pool ends the others.
-    with multiprocessing.get_context("spawn").Pool(min(os.cpu_count(), len(chunks)), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
-        parts = pool.starmap(play, chunks, chunksize=1)
-    rows = []
-    for n in distractors:
-        rows.append(summary(n, [row for part in parts for row in part[n]]))
-        print("{distractors:4d} {episodes:9d}        {success_aabb:.3f} +- {ci95:.3f}    {success_strict:.3f} +- {ci95_strict:.3f}   "
-              "{solved:.3f} {cut_short:10d}       {success_clear:.3f}        {success_blocked:.3f} ({blocked:.2f})        {z_drift:.3f} {mm:17.1f}"
-              .format(**rows[-1], mm=1000 * rows[-1]["read_error"]), flush=True)
-    if os.path.isdir(run):
-        lines = {row["distractors"]: [str(row[key]) if isinstance(row[key], int) else f"{row[key]:.4f}" for key in COLUMNS] for row in rows}
-        if os.path.exists(path):                               # rows of other N stay
-            with open(path, newline="") as file:
-                lines = {**{int(line[0]): line for line in list(csv.reader(file))[1:]}, **lines}
-        with open(path, "w", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows([COLUMNS, *(lines[n] for n in sorted(lines))])
+    ignore_ctrl_c = signal.signal, (signal.SIGINT, signal.SIG_IGN)
+    context = multiprocessing.get_context("spawn")
+    rows, begin = [], time.monotonic()
+    with context.Pool(min(os.cpu_count(), len(chunks)), *ignore_ctrl_c) as pool:
+        parts = pool.imap(play_chunk, chunks)                  # in order, as they are done
+        for n in distractors:
+            played = [episode for _ in firsts for episode in next(parts)]
+            rows.append(summary(n, played))
+            share = len(rows) / len(distractors)
+            elapsed = time.monotonic() - begin
+            print_row(rows[-1], elapsed / share - elapsed)
     return rows
 
 
-def read(run, name):
-    """Columns of a CSV of a run folder as float arrays; ValueError if the file is missing or empty."""
-    path = os.path.join(run, name)
-    try:
+def play_chunk(arguments):
+    return play(*arguments)
+
+
+def save_rows(path, rows):
+    """Write rows into a zeroshot.csv; rows of other N stay. ValueError if it is another file."""
+    lines = {}
+    if os.path.exists(path):
         with open(path, newline="") as file:
-            rows = list(csv.DictReader(file))
-        return {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
-    except (OSError, IndexError, TypeError, ValueError):
-        raise ValueError(f"{path} is missing or not a CSV of this project") from None
-
-
-def by_seed(runs):
-    """Runs that differ only in the seed, together: {"push-lrn-n2": [folder, ...]}."""
-    groups = {}
-    for run in runs:
-        groups.setdefault(re.sub(r"-seed\d+$", "", os.path.basename(os.path.normpath(run))), []).append(run)
-    return groups
-
-
-def evaluated(members):
-    """Have all these runs been played?"""
-    return all(os.path.exists(os.path.join(run, "zeroshot.csv")) for run in members)
-
-
-def over_seeds(runs, key):
-    """{N: (values, bar, half)} of a column of the runs' zeroshot.csv: each run's mean (S,), the half width of the 95 % interval of
-    their mean over the episodes of these runs, and that over seeds (Student's t, wide for few; one run: over its episodes)."""
-    cells, result = {}, {}
-    for run in runs:
-        rows = read(run, "zeroshot.csv")
-        for i, n in enumerate(rows["distractors"]):
-            share = rows["solved"][i]
-            bar = {"success_aabb": rows["ci95"][i], "success_strict": rows["ci95_strict"][i],
-                   "solved": 1.96 * np.sqrt(share * (1 - share) / rows["episodes"][i])}[key]
-            cells.setdefault(int(n), []).append((rows[key][i], bar))
-    for n in sorted(cells):
-        values, bars = np.array(cells[n]).T
-        S, bar = len(values), np.sqrt(np.square(bars).sum()) / len(bars)
-        half = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776}.get(S, 2.5) * values.std(ddof=1) / np.sqrt(S) if S > 1 else bar
-        result[n] = values, bar, half
-    return result
-
-
-def table(runs):
-    """Print README's tables of the runs that have been evaluated, one for each measure."""
-    groups = {name: members for name, members in by_seed(runs).items() if evaluated(members)}
-    if not groups:
-        return print("no zeroshot.csv in these runs yet: evaluate them with --episodes 200 first")
-    costs = {}
-    for name, members in groups.items():
-        frames, seconds = ([read(run, "timing.csv")[column][-1] for run in members] for column in ("frames", "seconds"))
-        costs[name] = f"| {name} | {len(members)} | {np.mean(frames) / 1e6:.1f} | {', '.join(f'{s / 60:.0f}' for s in seconds)} | "
-    for key, title in (("success_aabb", "axis-aligned"), ("success_strict", "strict"), ("solved", "solved")):
-        columns = {name: over_seeds(members, key) for name, members in groups.items()}
-        numbers = sorted({n for cells in columns.values() for n in cells})
-        print(f"| {title} | seeds | million frames | minutes | " + " | ".join(f"N = {n}" for n in numbers) + " |")
-        print("|---" * (4 + len(numbers)) + "|")
-        for name, cells in columns.items():
-            shown = {n: f"{values.mean():.2f} ± {half:.2f}" + (f"<br>{', '.join(f'{x:.2f}' for x in values)}" if len(values) > 1 else "")
-                     for n, (values, _, half) in cells.items()}
-            print(costs[name] + " | ".join(shown.get(n, "-") for n in numbers) + " |")
-        print()
-
-
-def plot(runs, path):
-    """Training curves (left) and zero-shot curves (right, with 95 % intervals over episodes) of the runs, as in figure 3; a
-    band spans the seeds."""
-    try:
-        import matplotlib
-    except ImportError:
-        raise ValueError("--plot needs matplotlib: pip install matplotlib") from None
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
-    for name, members in by_seed(runs).items():
-        progress = [read(run, "progress.csv") for run in members]
-        count = min(len(rows["frames"]) for rows in progress)
-        window, color = min(20, count), None
-        frames = progress[0]["frames"][window - 1:count] / 1e6
-        for key, style in (("success_aabb", "-"), ("success_strict", ":")):
-            smooth = [np.convolve(rows[key][:count], np.ones(window) / window, "valid") for rows in progress]
-            line, = left.plot(frames, np.mean(smooth, 0), style, label=name if style == "-" else None, color=color)
-            color = line.get_color()
-            left.fill_between(frames, np.min(smooth, 0), np.max(smooth, 0), color=color, alpha=0.15, linewidth=0)
-            if evaluated(members):
-                cells = over_seeds(members, key)
-                values, bars, _ = zip(*cells.values())
-                right.errorbar(list(cells), [x.mean() for x in values], bars, linestyle=style, marker="o", markersize=3, capsize=3, color=color)
-                right.fill_between(list(cells), [x.min() for x in values], [x.max() for x in values], color=color, alpha=0.15, linewidth=0)
-    left.set(xlabel="million frames", ylabel="fractional success, last step", title=f"training (mean of {window} updates)")
-    right.set(xlabel="distractors at test time", title="zero-shot (solid: axis-aligned, dotted: strict)")
-    right.xaxis.get_major_locator().set_params(integer=True)
-    for axes in (left, right):
-        axes.set_ylim(0, 1)
-        axes.grid(alpha=0.3)
-    figure.legend(loc="outside lower center", ncols=4)
-    figure.savefig(path, dpi=120)
+            header, *old = csv.reader(file)
+        lines = {int(line[0]): line for line in old}
+    for row in rows:
+        lines[row["distractors"]] = [
+            str(row[key]) if isinstance(row[key], int) else f"{row[key]:.4f}" for key in COLUMNS]
+    with open(path, "w", newline="") as file:
+        ordered = [lines[n] for n in sorted(lines)]
+        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *ordered])
     print(f"wrote {path}")
 
 
+def check_csv(path):
+    """ValueError if a file is in the way that is not a zeroshot.csv: refused before the play."""
+    if not os.path.exists(path):
+        return
+    with open(path, newline="") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    is_whole = all(len(row) == len(COLUMNS) and row[0].isdigit() for row in rows)
+    if tuple(header) != COLUMNS or not is_whole:
+        raise ValueError(f"{path} is not a zeroshot.csv of this version: remove it first")
+
+
+# ---- watching
+
+def play_live(agent, env, episode, mean_actions):
+    """Play one evaluation episode; yields the info at the start and after every step."""
+    noise = [np.random.default_rng(episode_seed(episode))]
+    obs, info = env.reset(seed=episode_seed(episode))
+    yield info
+    truncated = False
+    while not truncated:
+        action, = actions(agent, [obs], noise, mean_actions)
+        obs, _, _, truncated, info = env.step(action)
+        yield info
+
+
 @torch.inference_mode()
-def film(run, distractors, path, episode=0):
-    """Write one evaluation episode, played with sampled actions, as an animated GIF."""
+def watch(run, distractors, episodes, mean_actions):
+    """Play episodes in PyBullet's window, in real time, until it is closed or Ctrl-C."""
+    checkpoint, agent = load(run)
+    env = make_env(checkpoint["task"], distractors, checkpoint["settings"], render_mode="human")
+    print(f"{run} plays {episodes} episodes with {distractors} distractors; target blue, goal "
+          f"green, distractors red; close the window or press Ctrl-C to stop", flush=True)
+    try:
+        for episode in range(episodes):
+            for info in play_live(agent, env, episode, mean_actions):
+                pass
+            print(f"episode {episode}: fractional success {info['fractional_success']:.2f}",
+                  flush=True)
+        env.close()
+    except pybullet.error:
+        if pybullet.isConnected(env._client):
+            raise
+        print("the window was closed")
+
+
+@torch.inference_mode()
+def film(run, distractors, mean_actions, path, episode=0):
+    """Write one evaluation episode as an animated GIF."""
     try:
         from PIL import Image
     except ImportError:
         raise ValueError("--gif needs pillow: pip install pillow") from None
     checkpoint, agent = load(run)
-    env = make_env(checkpoint["task"], distractors, checkpoint["settings"], render_mode="rgb_array")
-    noise = np.random.default_rng(episode_seed(episode))
-    (obs, info), frames, truncated = env.reset(seed=episode_seed(episode)), [], False
-    every = max(1, round(0.08 / (env.substeps * env.timestep)))                # 12 pictures a second
-    while not truncated:
-        if len(frames) * every <= env._steps:
-            frames.append(Image.fromarray(env.render(320, 240)))
-        mean, log_std, _ = agent({key: torch.from_numpy(value)[None] for key, value in obs.items()})
-        obs, _, _, truncated, info = env.step(mean[0].numpy() + log_std.exp().numpy() * noise.standard_normal(9))
+    env = make_env(checkpoint["task"], distractors, checkpoint["settings"], "rgb_array")
+    every = max(1, round(0.08 / (env.substeps * env.timestep)))            # 12 pictures a second
+    pictures = []
+    for step, info in enumerate(play_live(agent, env, episode, mean_actions)):
+        if step % every == 0:
+            pictures.append(Image.fromarray(env.render(320, 240)))
     env.close()
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=80, loop=0)
-    print(f"wrote {path}: {distractors} distractors, fractional success {info['fractional_success']:.2f}")
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=80, loop=0)
+    print(f"wrote {path}: {distractors} distractors, fractional success "
+          f"{info['fractional_success']:.2f}")
 
+
+# ---- the command line
 
 def parse_range(text):
     """'0-9' or '2,5,14' or a mix: the sorted list of N."""
+    numbers = set()
     try:
-        numbers = set()
         for part in text.split(","):
             low, _, high = part.partition("-")
             numbers.update(range(int(low), int(high or low) + 1))
@@ -272,38 +334,66 @@ def parse_range(text):
     return sorted(numbers)
 
 
-def main():
-    parser = argparse.ArgumentParser(description="Play trained agents zero-shot at other N (see the first lines of evaluate.py).")
+def read_command():
+    parser = argparse.ArgumentParser(
+        description="Play trained agents zero-shot at other N (see the top of evaluate.py).")
     parser.error = fail
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder of train.py")
-    parser.add_argument("--distractors", default="0-9", metavar="LIST", help="numbers of distractors, as 0-9 or 0,2,14 (default 0-9)")
-    parser.add_argument("--episodes", type=int, default=200, metavar="E", help="episodes at each N; 0: show what was measured before (default 200)")
-    parser.add_argument("--mean-actions", action="store_true", help="play the mean of the policy instead of sampling")
-    parser.add_argument("--plot", metavar="FILE", help="draw training and zero-shot curves of all runs from their CSV files")
-    parser.add_argument("--gif", metavar="FILE", help="film an episode of the first run at the first N")
+    add = parser.add_argument
+    add("runs", nargs="+", metavar="RUN", help="run folder of train.py")
+    add("--distractors", metavar="LIST",
+        help="numbers of distractors, as 0-9 or 0,2,14 (default 0-9; to watch: as trained)")
+    add("--episodes", type=int, default=200, metavar="E", help="episodes at each N (default 200)")
+    add("--mean-actions", action="store_true",
+        help="play the mean of the policy instead of sampling")
+    add("--save", action="store_true",
+        help="write the rows to RUN/zeroshot.csv (zeroshot-mean.csv for mean actions)")
+    add("--watch", action="store_true", help="play the first run live in a window")
+    add("--gif", metavar="FILE", help="film one episode of the first run")
     args = parser.parse_args()
-    numbers = parse_range(args.distractors)
-    if args.episodes < 0:
-        fail(f"--episodes must be at least 0, got {args.episodes}")
-    for flag, path in (("--plot", args.plot), ("--gif", args.gif)):
-        if path and not os.path.isdir(os.path.dirname(path) or "."):
-            fail(f"{flag} {path}: there is no folder {os.path.dirname(path)}")
+    if args.episodes < 1:
+        fail(f"--episodes must be at least 1, got {args.episodes}")
+    if args.gif and not os.path.isdir(os.path.dirname(args.gif) or "."):
+        fail(f"--gif {args.gif}: there is no folder {os.path.dirname(args.gif)}")
+    return args
+
+
+def show(args):
+    """--watch and --gif: the first run at the first N, by default the one it was trained at."""
+    run = args.runs[0]
+    trained = load(run)[0]["distractors"]
+    distractors = parse_range(args.distractors)[0] if args.distractors else trained
+    if args.gif:
+        film(run, distractors, args.mean_actions, args.gif)
+    if args.watch:
+        watch(run, distractors, args.episodes, args.mean_actions)
+
+
+def sweep(args):
+    """Evaluate all runs, after a look at whatever could go wrong."""
+    numbers = parse_range(args.distractors or "0-9")
+    name = "zeroshot-mean.csv" if args.mean_actions else "zeroshot.csv"
+    for run in args.runs:
+        checkpoint, _ = load(run)
+        make_env(checkpoint["task"], numbers[-1], checkpoint["settings"]).close()
+        if args.save:
+            check_csv(os.path.join(run, name))
+    for run in args.runs:
+        rows = evaluate(run, numbers, args.episodes, args.mean_actions)
+        if args.save and rows:
+            save_rows(os.path.join(run, name), rows)
+
+
+def main():
+    args = read_command()
     try:
-        for run in args.runs:
-            checkpoint, _ = load(run)
-            make_env(checkpoint["task"], numbers[-1], checkpoint["settings"]).close()      # refuses an N that is too large
-        for run in args.runs if args.episodes else ():
-            evaluate(run, numbers, args.episodes, args.mean_actions)
-        if not args.episodes:
-            table(args.runs)
-        if args.plot:
-            plot(args.runs, args.plot)
-        if args.gif:
-            film(args.runs[0], numbers[0], args.gif)
+        if args.watch or args.gif:
+            show(args)
+        else:
+            sweep(args)
     except (ValueError, OSError) as error:
         fail(str(error))
     except KeyboardInterrupt:
-        fail("stopped; runs that were played to the end have their CSV", status=130)
+        fail("stopped; with --save, runs that were played to the end have their CSV", status=130)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,18 @@
-"""Proximal Policy Optimisation for dict observations and continuous actions (Schulman et al., 2017), one rank or many.
+"""Proximal Policy Optimisation (Schulman et al., 2017; the paper's appendix A.2), one rank or many.
 
-    L = -E[min(ratio A, clip(ratio, 1 - eps, 1 + eps) A)] + c_v E[(V - R)^2] / 2 - c_e H + auxiliary
+    L = -E[min(ratio A_t, clip(ratio, 1 - eps, 1 + eps) A_t)]      A_t advantages, eps `clip`
+        + c_v E[(V - R)^2] / 2                                     c_v `value_coef`
+        - c_e H                                                    c_e `entropy`, H the entropy
+        + c_a auxiliary loss                                       c_a `auxiliary`
 
-`agent(obs) -> (mean (B, A), log_std (A,), value (B,))` is all it asks of a network, reset and step of an environment
-(Gymnasium's signatures). Every rank steps its own environments; ranks average gradients and advantage statistics over
-torch.distributed (as in DD-PPO), so n ranks give the gradient of one rank on the joined batch.
+For dict observations and continuous actions. All it asks of a network is
+`agent(obs) -> (mean (B, A), log_std (A,), value (B,))`; of an environment, Gymnasium's reset and
+step. A rank is one of the processes that train together: each steps its own environments, and they
+average gradients and the moments of advantages and returns over torch.distributed (as DD-PPO
+does), so n ranks give the gradient of one rank on the joined minibatch.
 
-Shapes: T steps of a rollout, E environments of this rank, B = T * E samples, A actions; buffers are (T, E, ...).
+Shapes: T steps of a rollout, E environments of this rank, B = T * E samples, A actions.
+        What a rollout stores is (T, E, ...).
 Run:    python ppo.py        learns to reach a random point on a line, in a few seconds
 """
 import math
@@ -18,22 +24,28 @@ from torch import nn
 
 
 def gae(rewards, values, next_values, terminated, done, discount, lam):
-    """Generalised advantage estimation (Schulman et al., 2016), all inputs (T, E): returns advantages (T, E).
+    """Generalised advantage estimation (Schulman et al., 2016): inputs (T, E) -> advantages (T, E).
 
-    next_values[t] is the value of the observation that step t led to; at the end of an episode that is the final
-    observation, not the first one of the next episode. A termination has no future, so delta drops that value; a
-    truncation has one, so delta keeps it. The recursion is cut wherever an episode ends, for either reason (`done`).
+    next_values[t] is the value of the observation that step t led to. At the end of an episode
+    that is its final observation, not the first one of the next episode. A termination has no
+    future, so delta drops its value; a truncation has one, so delta keeps it. The recursion is cut
+    wherever an episode ends, for either reason, or the rollout does (`done`).
     """
-    advantages, following = torch.zeros_like(rewards), torch.zeros_like(rewards[0])
+    advantages = torch.zeros_like(rewards)
+    following = torch.zeros_like(rewards[0])                   # A_{t+1}, (E,)
     for t in reversed(range(len(rewards))):
+        # delta_t = r_t + gamma V(s_{t+1}) - V(s_t),   A_t = delta_t + gamma lambda A_{t+1}
         delta = rewards[t] + discount * (1 - terminated[t]) * next_values[t] - values[t]
-        following = advantages[t] = delta + discount * lam * (1 - done[t]) * following
+        advantages[t] = delta + discount * lam * (1 - done[t]) * following
+        following = advantages[t]
     return advantages
 
 
 def normal_log_prob(actions, mean, log_std):
-    """Log density (B,) of actions (B, A) under a diagonal Gaussian."""
-    return (-0.5 * ((actions - mean) * torch.exp(-log_std)) ** 2 - log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
+    """Log density (B,) of actions (B, A) under a Gaussian with independent components."""
+    scaled = (actions - mean) * torch.exp(-log_std)
+    log_density = -0.5 * scaled ** 2 - log_std - 0.5 * math.log(2 * math.pi)           # (B, A)
+    return log_density.sum(-1)
 
 
 def rank_mean(tensor):
@@ -44,169 +56,288 @@ def rank_mean(tensor):
     return tensor
 
 
+def as_one_vector(agent):
+    """Move all weights of `agent` into one vector, and their gradients into its `.grad`.
+
+    The agent's parameters become views of it. Averaging over ranks, clipping and Adam are then a
+    few operations in all instead of a few per layer, which on small networks costs as much as the
+    matrix products. Keep the views: never set a gradient to None, never call agent.to() afterwards.
+    """
+    parameters = list(agent.parameters())
+    weights = nn.utils.parameters_to_vector(parameters).detach()
+    weights.grad = torch.zeros_like(weights)
+    nn.utils.vector_to_parameters(weights, parameters)
+    sizes = [p.numel() for p in parameters]
+    for p, gradient in zip(parameters, weights.grad.split(sizes)):
+        p.grad = gradient.view_as(p)
+    return weights
+
+
 class PPO(nn.Module):
-    """The learner: agent, optimiser and value normaliser. Arguments are named as in the literature; per rank:
+    """The learner: agent, optimiser and value normaliser. Defaults suit small problems.
 
-    envs, steps     E environments, T steps each: a batch of T * E, cut into `minibatches` equal parts (ValueError if it
-                    does not divide) and passed over `epochs` times
-    anneal_lr, anneal_clip          multiply the learning rate / the clip range by the share of training that is left
-    normalize_advantages            to mean 0 and standard deviation 1 over the whole batch of all ranks
-    normalize_values                the value network learns (return - running mean) / running std
-    auxiliary       weight of `agent.auxiliary(obs)`, an extra loss on each minibatch; 0: never called
+    A module, so that its state dict holds the agent and the running moments of the returns.
 
-    Random numbers come from torch's global generator: seed it before rollout() and an update repeats exactly.
+    envs                   E environments of this rank
+    steps                  T steps of a rollout; a batch is T * E samples
+    minibatches, epochs    the batch is cut into equal parts and passed over `epochs` times;
+                           ValueError if it does not divide
+    lam                    GAE's lambda
+    entropy, value_coef    coefficients of the loss
+    anneal_lr, anneal_clip     multiply the learning rate, the clip range by the share of training
+                               that is left
+    normalize_advantages   to mean 0 and standard deviation 1 over the whole batch of all ranks
+    normalize_values       the value network learns (return - running mean) / running std
+    auxiliary              weight of `agent.auxiliary(obs)`, an extra loss on each minibatch;
+                           0: never called
+
+    Random numbers come from torch's global generator: seed it before rollout() and an update
+    repeats exactly.
     """
 
-    def __init__(self, agent, envs, *, steps=250, epochs=5, minibatches=8, lr=1e-3, adam_eps=1e-5, clip=0.2, discount=0.98, lam=0.95,
-                 entropy=0.001, value_coef=0.5, max_grad_norm=0.5, anneal_lr=True, anneal_clip=False,
-                 normalize_advantages=True, normalize_values=True, auxiliary=0.0):
+    def __init__(self, agent, envs, *, steps=250, epochs=5, minibatches=8, lr=1e-3, adam_eps=1e-5,
+                 clip=0.2, discount=0.98, lam=0.95, entropy=0.001, value_coef=0.5,
+                 max_grad_norm=0.5, anneal_lr=True, anneal_clip=False, normalize_advantages=True,
+                 normalize_values=True, auxiliary=0.0):
         super().__init__()
         if (steps * len(envs)) % minibatches:
-            raise ValueError(f"a batch of {steps} steps x {len(envs)} environments does not divide into {minibatches} minibatches")
+            raise ValueError(f"a batch of {steps} steps x {len(envs)} environments does not divide "
+                             f"into {minibatches} minibatches")
         self.agent, self.envs = agent, envs
         self.steps, self.epochs, self.minibatches = steps, epochs, minibatches
-        self.lr, self.clip, self.discount, self.lam = lr, clip, discount, lam
-        self.entropy, self.value_coef, self.max_grad_norm = entropy, value_coef, max_grad_norm
-        self.anneal_lr, self.anneal_clip, self.auxiliary = anneal_lr, anneal_clip, auxiliary
+        self.lr, self.anneal_lr = lr, anneal_lr
+        self.clip, self.anneal_clip = clip, anneal_clip
+        self.discount, self.lam = discount, lam
+        self.entropy_coef, self.value_coef, self.auxiliary_coef = entropy, value_coef, auxiliary
+        self.max_grad_norm = max_grad_norm
         self.normalize_advantages, self.normalize_values = normalize_advantages, normalize_values
         self.register_buffer("return_mean", torch.zeros(()))
         self.register_buffer("return_square", torch.ones(()))
         self.register_buffer("return_batches", torch.zeros(()))
-        # Weights and gradients become views of one vector each: averaging, clipping and Adam are then a few operations in
-        # all instead of a few per layer, which on small networks costs as much as the matrix products.
-        parameters = list(agent.parameters())
-        self.weights = nn.utils.parameters_to_vector(parameters).detach()
-        self.weights.grad = torch.zeros_like(self.weights)
-        nn.utils.vector_to_parameters(self.weights, parameters)
-        for p, grad in zip(parameters, self.weights.grad.split([p.numel() for p in parameters])):
-            p.grad = grad.view_as(p)
+        self.weights = as_one_vector(agent)
         self.optimizer = torch.optim.Adam([self.weights], lr=lr, eps=adam_eps)
-        self.buffer = None
+        self.observations = None
 
     def return_std(self):
-        return (self.return_square - self.return_mean ** 2).clamp(min=1e-8).sqrt()
+        variance = self.return_square - self.return_mean ** 2
+        return variance.clamp(min=1e-8).sqrt()
+
+    # ---- playing
 
     @torch.no_grad()
     def rollout(self, seeds):
-        """Play T steps in every environment, from a fresh episode each (`seeds`, one per environment).
+        """Play T steps in every environment, environment e from reset(seed=seeds[e]).
 
-        Starting fresh makes an update a function of weights and seeds alone, which is what lets a run resume exactly.
-        Returns the list of finished episodes as (return, length, info of the last step).
+        Starting fresh makes an update a function of weights and seeds alone, which is what lets a
+        run resume exactly. Leaves the batch for update() in self.observations and self.batch.
+        Returns the finished episodes: dicts with "return", "length" and "info", that of the last
+        step.
         """
-        T, E, first = self.steps, len(self.envs), [env.reset(seed=seed)[0] for env, seed in zip(self.envs, seeds)]
-        if self.buffer is None:
-            self.buffer = {key: torch.zeros(T, E, *value.shape) for key, value in first[0].items()}
-            self._views = {key: value.numpy() for key, value in self.buffer.items()}
-        for key, view in self._views.items():
-            view[0] = [obs[key] for obs in first]
+        first = [env.reset(seed=seed)[0] for env, seed in zip(self.envs, seeds)]
+        self.make_storage(first[0])
+        played, final_observations, episodes = self.play(first)
+        values = played["values"]
+        next_values = self.values_of_what_follows(values, final_observations)
+
+        # From the network's units to those of the rewards.
+        if self.normalize_values:
+            values = values * self.return_std() + self.return_mean
+            next_values = next_values * self.return_std() + self.return_mean
+        advantages = gae(played["rewards"], values, next_values, played["terminated"],
+                         played["done"], self.discount, self.lam)
+        returns = advantages + values                          # R, targets of the value network
+        # 1 - Var[R - V] / Var[R]
+        unexplained = (returns - values).var() / returns.var().clamp(min=1e-8)
+        self.explained_variance = 1 - unexplained
+        self.batch = {
+            "actions": played["actions"],
+            "old_log_prob": played["log_prob"],
+            "advantages": advantages,
+            "returns": returns,
+        }
+        return episodes
+
+    def make_storage(self, observation):
+        """Room for T observations of E environments, the same memory for numpy and for torch."""
+        if self.observations is not None:
+            return
+        T, E = self.steps, len(self.envs)
+        self.arrays = {key: np.zeros((T, E, *value.shape), np.float32)
+                       for key, value in observation.items()}
+        self.observations = {key: torch.from_numpy(array) for key, array in self.arrays.items()}
+
+    def play(self, current):
+        """Play T steps from the observations `current`, one per environment.
+
+        Returns what happened (dict of (T, E, ...) tensors), the final observations
+        {(t, e): observation} wherever an episode or the rollout ended, and the finished episodes.
+        """
+        T, E = self.steps, len(self.envs)
         rewards, terminated, done = (np.zeros((T, E), np.float32) for _ in range(3))
-        means, values, actions, noise = [], [], [], None
-        finished, ends, totals, lengths = [], {}, np.zeros(E), np.zeros(E, int)
+        actions, means, values = [], [], []
+        final_observations, episodes = {}, []
+        total, length = np.zeros(E), np.zeros(E, int)          # of the episodes under way
+        noise = None
         for t in range(T):
-            mean, log_std, value = self.agent({key: value[t] for key, value in self.buffer.items()})
-            if noise is None:
-                noise = torch.randn(T, *mean.shape) * log_std.exp()
-            actions.append(mean + noise[t])
+            for key, array in self.arrays.items():
+                array[t] = [observation[key] for observation in current]
+            mean, log_std, value = self.agent({key: x[t] for key, x in self.observations.items()})
+            if noise is None:                                  # all at once: one call, not T
+                noise = torch.randn(T, *mean.shape) * log_std.exp()        # (T, E, A)
             means.append(mean)
             values.append(value)
-            for e, (env, action) in enumerate(zip(self.envs, actions[t].numpy())):
-                obs, rewards[t, e], terminated[t, e], truncated, info = env.step(action)
-                totals[e] += rewards[t, e]
-                lengths[e] += 1
-                if terminated[t, e] or truncated or t == T - 1:
-                    done[t, e], ends[t, e] = True, obs
-                if terminated[t, e] or truncated:
-                    finished.append((totals[e], int(lengths[e]), info))
-                    totals[e] = lengths[e] = 0
-                    obs = env.reset()[0] if t < T - 1 else obs
-                if t < T - 1:
-                    for key, view in self._views.items():
-                        view[t + 1, e] = obs[key]
-        std = self.return_std() if self.normalize_values else 1.0
-        shift = self.return_mean if self.normalize_values else 0.0
-        values = torch.stack(values)                                           # (T, E), in the network's units
-        next_values = torch.cat([values[1:], values[:1]])                      # its last row is overwritten by `ends`
-        last = {key: torch.from_numpy(np.stack([obs[key] for obs in ends.values()])) for key in self.buffer}
-        next_values[tuple(torch.tensor(list(ends)).T)] = self.agent(last)[2]
-        rewards, terminated, done = (torch.from_numpy(x) for x in (rewards, terminated, done))
-        plain = values * std + shift
-        advantages = gae(rewards, plain, next_values * std + shift, terminated, done, self.discount, self.lam)
-        returns = advantages + plain
-        self.explained_variance = 1 - (returns - plain).var() / returns.var().clamp(min=1e-8)
-        actions, means = torch.stack(actions), torch.stack(means)
-        self.batch = {"actions": actions, "log_prob": normal_log_prob(actions, means, log_std), "advantages": advantages,
-                      "returns": returns}
-        return finished
+            actions.append(mean + noise[t])
+            for e, action in enumerate(actions[t].numpy()):
+                current[e], rewards[t, e], terminated[t, e], truncated, info = \
+                    self.envs[e].step(action)
+                total[e] += rewards[t, e]
+                length[e] += 1
+                over = terminated[t, e] or truncated
+                if over or t == T - 1:
+                    done[t, e] = True
+                    final_observations[t, e] = current[e]
+                if over:
+                    episodes.append({"return": total[e], "length": int(length[e]), "info": info})
+                    total[e] = length[e] = 0
+                if over and t < T - 1:                         # the next rollout() resets anyway
+                    current[e], _ = self.envs[e].reset()
+        played = {name: torch.from_numpy(array) for name, array in
+                  (("rewards", rewards), ("terminated", terminated), ("done", done))}
+        played["values"] = torch.stack(values)
+        played["actions"] = torch.stack(actions)
+        played["log_prob"] = normal_log_prob(played["actions"], torch.stack(means), log_std)
+        return played, final_observations, episodes
 
-    def loss(self, obs, actions, log_prob, advantages, returns, clip):
-        """PPO's loss on one minibatch (see the module's first lines) and its diagnostics."""
-        mean, log_std, value = self.agent(obs)
-        log_ratio = normal_log_prob(actions, mean, log_std) - log_prob
-        ratio = log_ratio.exp()
-        policy_loss = -torch.min(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages).mean()
-        value_loss = 0.5 * (value - returns).square().mean()
-        entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
-        loss = policy_loss + self.value_coef * value_loss - self.entropy * entropy
-        auxiliary = self.agent.auxiliary(obs) if self.auxiliary else torch.zeros(())
-        with torch.no_grad():
-            stats = {"policy_loss": policy_loss, "value_loss": value_loss, "auxiliary_loss": auxiliary, "entropy": entropy,
-                     "approx_kl": ((ratio - 1) - log_ratio).mean(),            # k3 (Schulman, 2020): unbiased, never negative
-                     "clip_fraction": ((ratio - 1).abs() > clip).float().mean()}
-        return loss + self.auxiliary * auxiliary, stats
+    def values_of_what_follows(self, values, final_observations):
+        """V(s_{t+1}) (T, E): the next row of `values`, or the value of a final observation."""
+        next_values = values.roll(-1, dims=0)                  # the last row is always replaced
+        observations = final_observations.values()
+        last = {key: torch.from_numpy(np.stack([observation[key] for observation in observations]))
+                for key in self.observations}
+        _, _, value = self.agent(last)
+        t, e = torch.tensor(list(final_observations)).T        # its keys are (t, e)
+        next_values[t, e] = value
+        return next_values
+
+    # ---- learning
 
     def update(self, left):
-        """Improve the agent on the last rollout; `left` is the share of training that is left. Returns mean diagnostics.
+        """Improve the agent on the last rollout; `left` is the share of training that is left.
 
-        FloatingPointError if a loss or gradient is not finite; the weights are then as before that step.
+        Returns the mean diagnostics. FloatingPointError if a gradient is not finite; the weights
+        are then as before that step.
         """
-        lr = self.lr * (left if self.anneal_lr else 1.0)
-        clip = self.clip * (left if self.anneal_clip else 1.0)
+        lr = self.lr * left if self.anneal_lr else self.lr
+        clip = self.clip * left if self.anneal_clip else self.clip
         for group in self.optimizer.param_groups:
             group["lr"] = lr
-        batch = {key: value.flatten(0, 1) for key, value in {**self.buffer, **self.batch}.items()}     # (B, ...)
-        moments = rank_mean(torch.stack([x for key in ("returns", "advantages")
-                                         for x in (batch[key].mean(), batch[key].square().mean())]))
-        if self.normalize_values:                              # running moments: plain mean at first, then over ~100 batches
+        batch = self.normalized_batch()
+        observations = {key: value.flatten(0, 1) for key, value in self.observations.items()}
+        count = len(batch["returns"])
+        means = {}
+        for _ in range(self.epochs):
+            for rows in torch.randperm(count).chunk(self.minibatches):
+                part = {key: value[rows] for key, value in batch.items()}
+                obs = {key: value[rows] for key, value in observations.items()}
+                for key, value in self.minibatch_step(obs, part, clip).items():
+                    share = value.detach() / (self.epochs * self.minibatches)
+                    means[key] = means.get(key, 0.0) + share
+        means["explained_variance"] = self.explained_variance
+        over_ranks = rank_mean(torch.stack([value.float() for value in means.values()]))
+        return {**dict(zip(means, over_ranks.tolist())), "lr": lr}
+
+    def normalized_batch(self):
+        """The last rollout as (B, ...) tensors with normalised returns and advantages.
+
+        Also moves the running moments on: this rollout's values were read with the old ones, and
+        the value network learns in units of the new ones; the two differ little.
+        """
+        batch = {key: value.flatten(0, 1) for key, value in self.batch.items()}
+        returns, advantages = batch["returns"], batch["advantages"]
+        moments = rank_mean(torch.stack([
+            returns.mean(), returns.square().mean(), advantages.mean(), advantages.square().mean()
+        ]))
+        return_mean, return_square, advantage_mean, advantage_square = moments
+        if self.normalize_values:
+            # Running moments: the plain mean at first, then over about 100 batches.
             self.return_batches += 1
             rate = max(1 / self.return_batches.item(), 0.01)
-            self.return_mean += rate * (moments[0] - self.return_mean)
-            self.return_square += rate * (moments[1] - self.return_square)
-            batch["returns"] = (batch["returns"] - self.return_mean) / self.return_std()
+            self.return_mean += rate * (return_mean - self.return_mean)
+            self.return_square += rate * (return_square - self.return_square)
+            batch["returns"] = (returns - self.return_mean) / self.return_std()
         if self.normalize_advantages:
-            std = (moments[3] - moments[2] ** 2).clamp(min=0).sqrt()
-            batch["advantages"] = (batch["advantages"] - moments[2]) / (std + 1e-8)
-        gradient, names, total = self.weights.grad, list(self.buffer), {}
-        for _ in range(self.epochs):
-            for rows in torch.randperm(len(batch["returns"])).chunk(self.minibatches):
-                part = {key: value[rows] for key, value in batch.items()}
-                loss, stats = self.loss({key: part.pop(key) for key in names}, **part, clip=clip)
-                gradient.zero_()
-                loss.backward()                                # adds to `gradient` through the views
-                norm = stats["grad_norm"] = rank_mean(gradient).norm()
-                if not torch.isfinite(norm):
-                    raise FloatingPointError(f"the gradient is not finite (loss {loss.item()})")
-                gradient *= (self.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
-                self.optimizer.step()
-                for key, value in stats.items():
-                    total[key] = total.get(key, 0.0) + value.detach() / (self.epochs * self.minibatches)
-        total["explained_variance"] = self.explained_variance
-        values = rank_mean(torch.stack([torch.as_tensor(v, dtype=torch.float32) for v in total.values()]))
-        return {**dict(zip(total, values.tolist())), "lr": lr}
+            std = (advantage_square - advantage_mean ** 2).clamp(min=0).sqrt()
+            batch["advantages"] = (advantages - advantage_mean) / (std + 1e-8)
+        return batch
+
+    def minibatch_step(self, obs, part, clip):
+        """One step of Adam on one minibatch, with the gradient averaged over ranks and clipped."""
+        loss, stats = self.loss(obs, clip=clip, **part)
+        gradient = self.weights.grad
+        gradient.zero_()
+        loss.backward()                                        # adds to `gradient` by the views
+        rank_mean(gradient)                                    # in place
+        norm = gradient.norm()
+        if not torch.isfinite(norm):
+            raise FloatingPointError(f"the gradient is not finite (loss {loss.item()})")
+        gradient *= (self.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
+        self.optimizer.step()
+        return {**stats, "grad_norm": norm}
+
+    def loss(self, obs, actions, old_log_prob, advantages, returns, clip):
+        """PPO's loss on one minibatch (the module's first lines) and its diagnostics."""
+        mean, log_std, value = self.agent(obs)
+        log_ratio = normal_log_prob(actions, mean, log_std) - old_log_prob
+        ratio = log_ratio.exp()                                # pi(a|s) / pi_old(a|s)
+
+        # L_policy = -E[min(ratio A_t, clip(ratio, 1 - eps, 1 + eps) A_t)]
+        clipped = ratio.clamp(1 - clip, 1 + clip)
+        policy_loss = -torch.min(ratio * advantages, clipped * advantages).mean()
+        # L_value = E[(V - R)^2] / 2
+        value_loss = 0.5 * (value - returns).square().mean()
+        # H of a Gaussian: sum_j (log sigma_j + log(2 pi e) / 2)
+        entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
+        loss = policy_loss + self.value_coef * value_loss - self.entropy_coef * entropy
+
+        auxiliary_loss = torch.zeros(())
+        if self.auxiliary_coef:
+            auxiliary_loss = self.agent.auxiliary(obs)
+            loss = loss + self.auxiliary_coef * auxiliary_loss
+        with torch.no_grad():
+            # E[(ratio - 1) - log ratio]: unbiased and never negative ("k3", Schulman, 2020)
+            approx_kl = ((ratio - 1) - log_ratio).mean()
+            clip_fraction = ((ratio - 1).abs() > clip).float().mean()
+        stats = {
+            "policy_loss": policy_loss,
+            "value_loss": value_loss,
+            "auxiliary_loss": auxiliary_loss,
+            "entropy": entropy,
+            "approx_kl": approx_kl,
+            "clip_fraction": clip_fraction,
+        }
+        return loss, stats
 
 
 class PointOnLine:
-    """A 1-D example: move a point by at most 0.2 a step until it is within 0.1 of a target; reward -distance."""
+    """A 1-D example: move a point by at most 0.2 a step to within 0.1 of a target."""
 
     def reset(self, *, seed=None, options=None):
         if seed is not None:
             self.rng = np.random.default_rng(seed)
-        self.x, self.target, self.steps = *self.rng.uniform(-1, 1, 2), 0
-        return {"x": np.array([self.x, self.target], np.float32)}, {}
+        self.x, self.target = self.rng.uniform(-1, 1, 2)
+        self.steps = 0
+        return self.observation(), {}
 
     def step(self, action):
-        self.x, self.steps = self.x + 0.2 * float(np.clip(action[0], -1, 1)), self.steps + 1
+        self.x += 0.2 * float(np.clip(action[0], -1, 1))
+        self.steps += 1
         gap = abs(self.x - self.target)
-        return {"x": np.array([self.x, self.target], np.float32)}, -gap, bool(gap < 0.1), self.steps >= 20, {"gap": gap}
+        terminated = bool(gap < 0.1)
+        truncated = self.steps >= 20
+        return self.observation(), -gap, terminated, truncated, {"gap": gap}
+
+    def observation(self):
+        return {"x": np.array([self.x, self.target], np.float32)}
 
 
 class TinyAgent(nn.Module):
@@ -214,7 +345,8 @@ class TinyAgent(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.mean, self.value = (nn.Sequential(nn.Linear(2, 32), nn.Tanh(), nn.Linear(32, 1)) for _ in range(2))
+        self.mean = nn.Sequential(nn.Linear(2, 32), nn.Tanh(), nn.Linear(32, 1))
+        self.value = nn.Sequential(nn.Linear(2, 32), nn.Tanh(), nn.Linear(32, 1))
         self.log_std = nn.Parameter(torch.full((1,), -0.5))
 
     def forward(self, obs):
@@ -228,6 +360,8 @@ if __name__ == "__main__":
         episodes = learner.rollout([1000 * update + e for e in range(8)])
         stats = learner.update(1 - update / 30)
         if update % 5 == 4:
-            print(f"update {update + 1:2d}: mean return {np.mean([e[0] for e in episodes]):6.2f}, mean final gap "
-                  f"{np.mean([e[2]['gap'] for e in episodes]):.2f}, KL {stats['approx_kl']:.4f}, "
+            mean_return = np.mean([episode["return"] for episode in episodes])
+            mean_gap = np.mean([episode["info"]["gap"] for episode in episodes])
+            print(f"update {update + 1:2d}: mean return {mean_return:6.2f}, mean final gap "
+                  f"{mean_gap:.2f}, KL {stats['approx_kl']:.4f}, "
                   f"explained variance {stats['explained_variance']:.2f}")

@@ -1,70 +1,115 @@
-"""TriFinger with N+1 cubes in PyBullet: the PushingCube and LiftingCube tasks of the paper (section 4.1, appendix A).
+"""TriFinger with N+1 cubes in PyBullet: PushingCube and LiftingCube (section 4.1, A.1, A.3).
 
-A three-finger robot (9 joints) stands over a round arena with N+1 identical cubes. The goal names one of them by an
-identifier; that cube has to reach the goal pose, the other N are distractors. The robot and the arena are made of
-primitives by this file: no mesh, no data file. Signatures are Gymnasium's, Gymnasium itself is not needed.
+A three-finger robot (9 joints) stands over a round arena with N+1 identical cubes. The goal names
+one of them by an identifier; that cube has to reach the goal pose, the other N are distractors.
+The robot and the arena are made of primitives by this file: no mesh, no data file. The class has
+Gymnasium's signatures, and with gymnasium installed it is a gymnasium.Env.
 
-Shapes: observation {"cubes": (N+1, 18), "fingers": (3, 10), "goal": (12,)} float32 (Table 1), action (9,) in [-1, 1].
-Run:    python trifinger_env.py        prints the speed table: frames/s by N and the share of physics in a step
+Shapes: observation {"cubes": (N+1, 18), "fingers": (3, 10), "goal": (12,)} float32 (Table 1),
+        action (9,) in [-1, 1].
+Run:    python trifinger_env.py        prints frames/s by N and the share of physics in a step
 """
 import math
 import os
 import sys
 import tempfile
 import time
+from typing import NamedTuple
 
 import numpy as np
 import pybullet as pb
 
+try:
+    from gymnasium import Env, spaces
+except ImportError:                      # the same class without it
+    Env, spaces = object, None
+
+# The arena
 CUBE = 0.065                             # edge of a cube, m
 WALL = 0.242                             # inner radius of the arena, m
-REACH = 0.124                            # a cube inside this radius can be pushed inward from every side, m
-BASE, HEIGHT, LINK, OFFSET = 0.0455, 0.34, 0.16, 0.05945       # robot: mounting radius and height, link length, side step, m
-LOWER, UPPER = (-1.57, -1.2, -3.0), (1.0, 1.57, 3.0)           # limits of upper, middle and lower joint, rad
-REST = (0.0, 0.55, -0.7)                 # joint angles at reset: the tips hang beside the cubes at z = 0.045 m
-JOINTS = tuple(range(9))                 # upper, middle, lower of finger 0, then 1, then 2
-TORQUE = 0.36                            # N m
-TIP = 0.0095                             # radius of a finger's lower link and tip, m
+WALL_SIDES = 12                          # the round wall is made of so many boxes
+REACH = 0.124                            # inside this radius a finger can get behind a cube, m
 CUBE_MASS = 0.08                         # kg
-FRICTION = {"cube": 1.0, "finger": 0.1, "floor": 0.5}          # Bullet multiplies the two in contact
-IDENTIFIERS = np.linspace(-1.0, 1.0, 21)                       # pool that covers every N, so none is new when N grows
-YAW = [-math.radians(90 + 120 * k) for k in range(3)]          # heading of finger k
-HEADING = [(math.sin(yaw), math.cos(yaw)) for yaw in YAW]
+FRICTION = {"cube": 1.0, "finger": 0.1, "floor": 0.5}          # Bullet multiplies the two
+IDENTIFIERS = np.linspace(-1.0, 1.0, 21)                       # pool: none is new when N grows
 
-# Table 1, with the divisor that brings each entry to about [-1, 1]; fixed numbers, so nothing here depends on N.
-CUBE_SCALE = [1] + [CUBE] * 3 + [0.2] * 3 + [1] * 4 + [0.5] * 3 + [10] * 3 + [1]    # type size pos quat v omega id
-GOAL_SCALE = [1] + [CUBE] * 3 + [0.2] * 3 + [1] * 4 + [1]                           # type size pos quat id
-FINGER_SCALE = [1.5] * 3 + [10] * 3 + [1] + [0.2] * 3                               # q dq id tip
+# The robot: joints are upper, middle, lower of finger 0, then of 1, then of 2
+JOINTS = tuple(range(9))
+BASE = 0.0455                            # radius at which fingers are mounted, m
+HEIGHT = 0.34                            # height at which fingers are mounted, m
+LINK = 0.16                              # length of the middle and the lower link, m
+OFFSET = 0.05945                         # how far a fingertip stands beside the finger's plane, m
+TIP = 0.0095                             # radius of a finger's lower link and tip, m
+LOWER = (-1.57, -1.2, -3.0)              # limits of upper, middle and lower joint, rad
+UPPER = (1.0, 1.57, 3.0)
+REST = (0.0, 0.55, -0.7)                 # at reset, rad: tips hang beside the cubes, 0.045 m high
+TORQUE = 0.36                            # N m
+DELTA = 0.3                              # rad, largest step of action_mode="delta"
+FINGER_YAW = [-math.radians(90 + 120 * k) for k in range(3)]   # heading of finger k
+FINGER_SIN_COS = [(math.sin(yaw), math.cos(yaw)) for yaw in FINGER_YAW]
+
+# Table 1: columns of an observation's rows, for readers and for whoever picks some out. The
+# identifier comes last in cubes and goal.
+SIZE, POSITION, QUATERNION = slice(1, 4), slice(4, 7), slice(7, 11)        # of a cube and the goal
+LINEAR, ANGULAR = slice(11, 14), slice(14, 17)                             # of a cube
+IDENTIFIER = -1                                                            # of a cube and the goal
+FINGER_IDENTIFIER, FINGERTIP = 6, slice(7, 10)                             # of a finger
+
+# What each column is divided by to be within about [-1, 1]: fixed numbers, so that nothing here
+# depends on N.
+POSITION_SCALE = 0.2                     # m
+POSE_SCALE = [1] + [CUBE] * 3 + [POSITION_SCALE] * 3 + [1] * 4             # type size pos quat
+CUBE_SCALE = POSE_SCALE + [0.5] * 3 + [10] * 3 + [1]                       # ... v omega id
+GOAL_SCALE = POSE_SCALE + [1]                                              # ... id
+FINGER_SCALE = [1.5] * 3 + [10] * 3 + [1] + [POSITION_SCALE] * 3           # q dq id tip
+
+BETA = 0.05                              # exponent of the curiosity term (A.1)
 REWARD_WEIGHTS = {"overlap": 100.0, "distance": 5000.0, "curiosity": 0.0, "reach": 2500.0}
+SOLVED = 0.8                             # fractional success from which a task counts as solved
 
+
+# ---- geometry
 
 def forward_kinematics(k, q):
     """Fingertip (x, y, z) in m of finger k at joint angles q (3,) in rad, in the world frame."""
-    s0, c0 = math.sin(q[0]), math.cos(q[0])
-    x = -LINK * (math.sin(q[1]) + math.sin(q[1] + q[2])) - BASE
-    w = -LINK * (math.cos(q[1]) + math.cos(q[1] + q[2]))       # depth below the upper joint, in the finger's plane
-    y, z = -OFFSET * c0 + w * s0, OFFSET * s0 + w * c0
-    s, c = HEADING[k]
+    q0, q1, q2 = q
+    s0, c0 = math.sin(q0), math.cos(q0)
+    x = -LINK * (math.sin(q1) + math.sin(q1 + q2)) - BASE
+    depth = -LINK * (math.cos(q1) + math.cos(q1 + q2))         # in the finger's plane, negative
+    y = -OFFSET * c0 + depth * s0
+    z = OFFSET * s0 + depth * c0
+    s, c = FINGER_SIN_COS[k]                                   # turn by the finger's heading
     return c * x - s * y, s * x + c * y, z + HEIGHT
 
 
 def inverse_kinematics(k, tip):
-    """Joint angles (3,) in rad that bring finger k's tip to `tip` (3,) in m. ValueError if it is out of reach."""
-    s, c = HEADING[k]
-    x, y, z = c * tip[0] + s * tip[1] + BASE, -s * tip[0] + c * tip[1], tip[2] - HEIGHT
-    depth = y * y + z * z - OFFSET ** 2
-    w = -math.sqrt(max(depth, 0.0))
-    r = math.hypot(x, w)
-    if depth < 0 or r > 2 * LINK:
+    """Joint angles (3,) in rad that bring finger k's tip to `tip` (3,) in m.
+
+    ValueError if it is out of reach. Joint limits are not looked at.
+    """
+    s, c = FINGER_SIN_COS[k]
+    x = c * tip[0] + s * tip[1] + BASE
+    y = -s * tip[0] + c * tip[1]
+    z = tip[2] - HEIGHT
+    depth_squared = y * y + z * z - OFFSET ** 2
+    depth = -math.sqrt(max(depth_squared, 0.0))
+    reach = math.hypot(x, depth)
+    if depth_squared < 0 or reach > 2 * LINK:
         raise ValueError(f"finger {k} cannot reach {tuple(tip)}")
-    q0 = math.remainder(math.atan2(w, -OFFSET) - math.atan2(z, y), 2 * math.pi)
-    q2 = -2 * math.acos(r / (2 * LINK))
-    return q0, math.atan2(-x, -w) - q2 / 2, q2
+    q0 = math.remainder(math.atan2(depth, -OFFSET) - math.atan2(z, y), 2 * math.pi)
+    q2 = -2 * math.acos(reach / (2 * LINK))
+    q1 = math.atan2(-x, -depth) - q2 / 2
+    return q0, q1, q2
 
 
 def clip(values, low, high):
-    """Values limited to [low, high] one by one; plain python, which on nine numbers beats numpy."""
+    """Values limited to [low, high] one by one; on nine numbers plain python beats numpy."""
     return [a if v < a else b if v > b else v for v, a, b in zip(values, low, high)]
+
+
+def yaw_quaternion(yaw):
+    """Quaternion (x, y, z, w) of a turn by `yaw` rad about the vertical axis."""
+    return 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
 
 
 def rotation(quaternion):
@@ -73,7 +118,8 @@ def rotation(quaternion):
 
 
 def aabb_half_extents(quaternion):
-    """Half edges (3,) in m of the axis-aligned box around a cube turned by `quaternion`; plain python, for speed."""
+    """Half edges (3,) in m of the axis-aligned box around a cube turned by `quaternion`."""
+    # CUBE / 2 times the row sums of |R|, written out: plain python, for speed.
     x, y, z, w = quaternion
     return (CUBE * (abs(0.5 - y * y - z * z) + abs(x * y - z * w) + abs(x * z + y * w)),
             CUBE * (abs(x * y + z * w) + abs(0.5 - x * x - z * z) + abs(y * z - x * w)),
@@ -81,352 +127,564 @@ def aabb_half_extents(quaternion):
 
 
 def aabb_overlap(cube, goal):
-    """Fractional success rho as CausalWorld measures it: vol(AABB(goal) n AABB(cube)) / vol(AABB(goal)), in [0, 1].
+    """Fractional success rho as CausalWorld measures it, in [0, 1].
 
-    `cube` and `goal` are (position (3,), quaternion (4,)). Lenient: turning the cube only makes its box larger.
+    rho = vol(AABB(goal) and AABB(cube)) / vol(AABB(goal)), the volume that both boxes share in the
+    numerator; `cube` and `goal` are (position (3,), quaternion (4,)). It is lenient: turning the
+    cube only makes its box larger.
     """
     share = 1.0
-    for c, g, hc, hg in zip(cube[0], goal[0], aabb_half_extents(cube[1]), aabb_half_extents(goal[1])):
-        share *= max(min(c + hc, g + hg) - max(c - hc, g - hg), 0.0) / (2 * hg)
+    halves = zip(aabb_half_extents(cube[1]), aabb_half_extents(goal[1]))
+    for at_cube, at_goal, (half_cube, half_goal) in zip(cube[0], goal[0], halves):
+        low = max(at_cube - half_cube, at_goal - half_goal)
+        high = min(at_cube + half_cube, at_goal + half_goal)
+        share *= max(high - low, 0.0) / (2 * half_goal)
     return min(share, 1.0)
 
 
 def oriented_overlap(cube, goal):
-    """The strict form of rho: share of the goal cube's true volume that the cube covers, orientation included.
+    """The strict form of rho: share of the goal cube's true volume that the cube covers.
 
-    Cuts the cube's six faces (and the caps that the cuts leave) by the goal's six planes, in the goal's frame; the volume
-    of what is left is the sum of the pyramids from a point inside to every face.
+    Works in the goal's frame: cuts the cube by the goal's six planes (Sutherland-Hodgman) and
+    measures what is left.
     """
-    to_goal, h = rotation(goal[1]).T, CUBE / 2
-    centre, axes = to_goal @ (np.subtract(cube[0], goal[0])), to_goal @ rotation(cube[1])
-    faces = []
-    for i in range(3):
-        u, v = axes[:, (i + 1) % 3] * h, axes[:, (i + 2) % 3] * h
-        for side in (-h, h):
-            faces.append([centre + axes[:, i] * side + a * u + b * v for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
+    to_goal = rotation(goal[1]).T
+    centre = to_goal @ np.subtract(cube[0], goal[0])
+    axes = to_goal @ rotation(cube[1])
+    faces = cube_faces(centre, axes)
     for axis in range(3):
         for sign in (-1, 1):
-            kept, cap = [], []
-            for face in faces:
-                new = []
-                for p, q in zip(face, face[1:] + face[:1]):
-                    dp, dq = sign * p[axis] - h, sign * q[axis] - h        # > 0: beyond this plane of the goal
-                    if dp <= 0:
-                        new.append(p)
-                    if (dp < 0 < dq) or (dq < 0 < dp):
-                        new.append(p + (q - p) * dp / (dp - dq))
-                        cap.append(new[-1])
-                if len(new) > 2:
-                    kept.append(new)
-            if len(cap) > 2:                                               # close the cut: order its corners by angle
-                d = np.array(cap) - np.mean(cap, axis=0)
-                angle = np.arctan2(d[:, axis - 1], d[:, axis - 2])
-                kept.append([cap[j] for j in np.argsort(angle)])
-            faces = kept
+            faces = cut(faces, axis, sign)
+    return float(min(volume(faces) / CUBE ** 3, 1.0))
+
+
+def cube_faces(centre, axes):
+    """The six faces of a cube, each a list of four corners (3,) in order; `axes` are columns."""
+    faces, half = [], CUBE / 2
+    for i in range(3):
+        u = axes[:, (i + 1) % 3] * half
+        v = axes[:, (i + 2) % 3] * half
+        for side in (-half, half):
+            middle = centre + axes[:, i] * side
+            faces.append([middle + a * u + b * v for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
+    return faces
+
+
+def cut(faces, axis, sign):
+    """What is left of a convex body inside the goal's plane sign * x[axis] = CUBE / 2."""
+    kept, cap = [], []
+    for face in faces:
+        inside = []
+        for p, q in zip(face, face[1:] + face[:1]):
+            beyond_p = sign * p[axis] - CUBE / 2               # > 0: beyond the plane
+            beyond_q = sign * q[axis] - CUBE / 2
+            if beyond_p <= 0:
+                inside.append(p)
+            if beyond_p < 0 < beyond_q or beyond_q < 0 < beyond_p:
+                crossing = p + (q - p) * beyond_p / (beyond_p - beyond_q)
+                inside.append(crossing)
+                cap.append(crossing)
+        if len(inside) > 2:
+            kept.append(inside)
+    if len(cap) > 2:                                           # close the cut with a face
+        spokes = np.array(cap) - np.mean(cap, axis=0)
+        angles = np.arctan2(spokes[:, axis - 1], spokes[:, axis - 2])
+        kept.append([cap[j] for j in np.argsort(angles)])
+    return kept
+
+
+def volume(faces):
+    """Volume of a convex body: the sum of the pyramids from a point inside to every triangle."""
     if not faces:
         return 0.0
-    inside = np.mean([p for face in faces for p in face], axis=0)
-    volume = sum(abs(np.dot(np.cross(face[j] - face[0], face[j + 1] - face[0]), face[0] - inside)) / 6
-                 for face in faces for j in range(1, len(face) - 1))
-    return float(min(volume / CUBE ** 3, 1.0))
+    inside = np.mean([corner for face in faces for corner in face], axis=0)
+    total = 0.0
+    for face in faces:
+        for second, third in zip(face[1:], face[2:]):
+            normal = np.cross(second - face[0], third - face[0])
+            total += abs(np.dot(normal, face[0] - inside)) / 6
+    return total
 
 
 def squares_overlap(a, b):
-    """(n, m) bool: does square i of a (n, 4) touch square j of b (m, 4)? Rows: x, y, yaw, half edge (separating axes)."""
-    a, b = np.asarray(a)[:, None], np.asarray(b)[None]                     # (n, 1, 4), (1, m, 4)
+    """(n, m) bool: does square i of a (n, 4) touch square j of b (m, 4)?
+
+    Rows are x, y, yaw, half edge. Two squares are apart if the projections on one of their edges'
+    directions are (separating axes).
+    """
+    a, b = np.asarray(a)[:, None], np.asarray(b)[None]         # (n, 1, 4), (1, m, 4)
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
-    turn = np.abs(np.cos(b[..., 2] - a[..., 2])) + np.abs(np.sin(b[..., 2] - a[..., 2]))
+    between = b[..., 2] - a[..., 2]
+    widening = np.abs(np.cos(between)) + np.abs(np.sin(between))
     apart = np.zeros(dx.shape, bool)
-    for s, own, other in ((a, a[..., 3], b[..., 3]), (b, b[..., 3], a[..., 3])):
-        cos, sin = np.cos(s[..., 2]), np.sin(s[..., 2])
+    for square, own, other in ((a, a[..., 3], b[..., 3]), (b, b[..., 3], a[..., 3])):
+        cos, sin = np.cos(square[..., 2]), np.sin(square[..., 2])
         for along in (cos * dx + sin * dy, cos * dy - sin * dx):
-            apart |= np.abs(along) > own + other * turn
+            apart |= np.abs(along) > own + other * widening
     return ~apart
 
 
+def corners_inside(squares):
+    """(n,) bool: do the corners of squares (n, 4), rows as above, keep off the wall?"""
+    quarter = math.pi / 4 + math.pi / 2 * np.arange(4)
+    angle = squares[:, 2:3] + quarter                          # (n, 4)
+    x = squares[:, :1] + CUBE / math.sqrt(2) * np.cos(angle)
+    y = squares[:, 1:2] + CUBE / math.sqrt(2) * np.sin(angle)
+    return (np.hypot(x, y) < WALL - 0.001).all(1)
+
+
+# ---- the robot as an URDF
+
+JOINT_COLOR, METAL, PLASTIC = "0.95 0.55 0.15 1", "0.45 0.47 0.52 1", "0.2 0.2 0.23 1"
+
+
+def origin(xyz, rpy=(0, 0, 0)):
+    return f'<origin xyz="{" ".join(map(str, xyz))}" rpy="{" ".join(map(str, rpy))}"/>'
+
+
+def picture(place, shape, color):
+    """A visual element; without an effect on the dynamics."""
+    return (f'<visual>{place}<geometry>{shape}</geometry>'
+            f'<material name="{color}"><color rgba="{color}"/></material></visual>\n')
+
+
+def bar(start, end, radius, color):
+    """Picture of a capsule from `start` to `end` (3,)."""
+    start, end = np.array(start, float), np.array(end, float)
+    x, y, z = end - start
+    length = math.hypot(x, y, z)
+    along = (0, math.acos(z / length), math.atan2(y, x))       # roll, pitch, yaw of the axis
+    shape = f'<capsule radius="{radius}" length="{length}"/>'
+    return picture(origin((start + end) / 2, along), shape, color)
+
+
+def ball(centre, radius, color):
+    """Picture of a sphere."""
+    return picture(origin(centre), f'<sphere radius="{radius}"/>', color)
+
+
+def link(name, mass, centre_of_mass, inertia, pictures, collision=""):
+    ixx, iyy, izz = inertia
+    return (f'<link name="{name}"><inertial>{origin(centre_of_mass)}<mass value="{mass}"/>'
+            f'<inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0" ixz="0" iyz="0"/></inertial>'
+            f'\n{"".join(pictures)}{collision}</link>\n')
+
+
+def joint(parent, child, place, axis, lower, upper):
+    return (f'<joint name="{child}" type="revolute"><parent link="{parent}"/>'
+            f'<child link="{child}"/>{place}<axis xyz="{axis}"/>'
+            f'<limit lower="{lower}" upper="{upper}" effort="{TORQUE}" velocity="100"/></joint>\n')
+
+
 def robot_urdf():
-    """URDF of the robot from capsules; a tip is merged into its lower link. Only lower links can touch things."""
-    def link(name, mass, com, inertia, radius, length, xyz, rpy, collides):
-        shape = f'<origin xyz="{xyz}" rpy="{rpy}"/><geometry><capsule radius="{radius}" length="{length}"/></geometry>'
-        return (f'<link name="{name}"><inertial><origin xyz="{com}"/><mass value="{mass}"/><inertia ixx="{inertia[0]}" '
-                f'iyy="{inertia[1]}" izz="{inertia[2]}" ixy="0" ixz="0" iyz="0"/></inertial><visual>{shape}</visual>'
-                + (f'<collision>{shape}</collision>' if collides else '') + '</link>')
+    """URDF of the robot: masses and inertias of TriFingerEdu, a tip merged into its lower link.
 
-    def joint(parent, child, xyz, axis, limits, yaw=0.0):
-        return (f'<joint name="{child}" type="revolute"><parent link="{parent}"/><child link="{child}"/><origin xyz="{xyz}" '
-                f'rpy="0 0 {yaw}"/><axis xyz="{axis}"/><limit lower="{limits[0]}" upper="{limits[1]}" effort="{TORQUE}" '
-                'velocity="100"/></joint>')
+    Only the lower links can touch things. What is drawn reaches from joint to joint. Lines are kept
+    short because PyBullet breaks a line after 1023 characters, wherever that is.
+    """
+    knee, tip = (0, -0.03745, -0.16), (0, -0.008, -0.16)       # joints of the next link, its tip
+    touching = (f'<collision>{origin((0, -0.008, -0.08))}<geometry>'
+                f'<capsule radius="{TIP}" length="{LINK}"/></geometry></collision>')
+    mounts = [(-BASE * math.cos(yaw), -BASE * math.sin(yaw), HEIGHT) for yaw in FINGER_YAW]
+    hub = [bar((0, 0, HEIGHT), mount, 0.018, METAL) for mount in mounts]
+    parts = [link("base", 0, (0, 0, 0), (0, 0, 0), hub)]
+    for k, (yaw, mount) in enumerate(zip(FINGER_YAW, mounts)):
+        upper = [ball((0, 0, 0), 0.021, JOINT_COLOR), bar((0, 0, 0), (-0.10, 0, 0), 0.017, PLASTIC)]
+        middle = [ball((0, 0, 0), 0.019, JOINT_COLOR), bar((0, 0, 0), knee, 0.013, METAL)]
+        lower = [ball((0, 0, 0), 0.016, JOINT_COLOR), ball(tip, 0.011, JOINT_COLOR),
+                 bar((0, 0, 0), tip, TIP, PLASTIC)]
+        parts += [
+            link(f"upper{k}", 0.14854, (-0.079, 0, 0), (3e-5, 4.1e-4, 4.1e-4), upper),
+            link(f"middle{k}", 0.14854, (0, -0.019, -0.079), (4.1e-4, 4.1e-4, 3e-5), middle),
+            link(f"lower{k}", 0.0407, (0, -0.00875, -0.1065), (1.6e-4, 1.6e-4, 1e-5), lower,
+                 touching),
+            joint("base", f"upper{k}", origin(mount, (0, 0, yaw)), "-1 0 0", LOWER[0], UPPER[0]),
+            joint(f"upper{k}", f"middle{k}", origin((0, -0.014, 0)), "0 1 0", LOWER[1], UPPER[1]),
+            joint(f"middle{k}", f"lower{k}", origin(knee), "0 1 0", LOWER[2], UPPER[2]),
+        ]
+    return f'<robot name="trifinger">{"".join(parts)}</robot>'
 
-    urdf = ('<robot name="trifinger"><link name="base"><inertial><mass value="0"/><inertia ixx="0" iyy="0" izz="0" ixy="0" '
-            'ixz="0" iyz="0"/></inertial></link>')
-    limits = list(zip(LOWER, UPPER))
-    for k, yaw in enumerate(YAW):
-        origin = f"{-BASE * math.cos(yaw)} {-BASE * math.sin(yaw)} {HEIGHT}"
-        urdf += link(f"upper{k}", 0.14854, "-0.079 0 0", (3e-5, 4.1e-4, 4.1e-4), 0.016, 0.13, "-0.065 0 0", f"0 {math.pi / 2} 0", False)
-        urdf += link(f"middle{k}", 0.14854, "0 -0.019 -0.079", (4.1e-4, 4.1e-4, 3e-5), 0.014, 0.13, "0 -0.02 -0.08", "0 0 0", False)
-        urdf += link(f"lower{k}", 0.0407, "0 -0.00875 -0.1065", (1.6e-4, 1.6e-4, 1e-5), TIP, LINK, "0 -0.008 -0.08", "0 0 0", True)
-        urdf += joint("base", f"upper{k}", origin, "-1 0 0", limits[0], yaw)
-        urdf += joint(f"upper{k}", f"middle{k}", "0 -0.014 0", "0 1 0", limits[1])
-        urdf += joint(f"middle{k}", f"lower{k}", "0 -0.03745 -0.16", "0 1 0", limits[2])
-    return urdf + '</robot>'
+
+# ---- the environment
+
+class Moment(NamedTuple):
+    """What the reward compares between two steps; lengths in m."""
+    tips: list                           # three fingertips (3,), world frame
+    position: tuple                      # target cube's centre (3,)
+    rho: float                           # fractional success
+    to_goal: float                       # distance from target cube to goal
+    to_tips: float                       # Frobenius norm of (fingertips - target cube)
 
 
-class TriFingerEnv:
+class TriFingerEnv(Env):
     """PushingCube (task="push") or LiftingCube (task="lift") with `distractors` + 1 cubes.
 
     distractors     N, 0 to 20. ValueError beyond what the arena and the pool of identifiers hold.
-    episode_steps   actions in an episode; it does not depend on N, or N would change the task. 250 at 25 Hz = 10 s.
-    substeps, timestep   physics steps per action and their length in s: control rate = 1 / (substeps * timestep).
-                    The paper's 83.3 Hz and 30 s: episode_steps=2500, substeps=3, timestep=0.004.
-    action_mode     "delta": joint target = measured angle + 0.3 rad * action; "absolute": the action spans the joint range.
-    goal_yaw        goal's largest yaw in rad. With 0 the goal is axis-aligned, and rho needs position only.
-    reward_weights  weights that replace those of REWARD_WEIGHTS, by name (appendix A.1; "reach" is ours):
-                    overlap    rho_t
-                    distance   d(o_{t-1}, g) - d(o_t, g): positive for moving closer (the paper prints the opposite sign)
-                    curiosity  (1 - rho_t)^0.05 log(d(o_t, o_{t-1}) + 1e-5)
-                    reach      decrease of the Frobenius norm of (fingertips - target cube)
-    render_mode     None, "rgb_array" (headless), or "human" (PyBullet's window, in real time).
+    episode_steps   actions in an episode; the same for every N, or N would change the task
+    substeps, timestep   physics steps per action and their length in s: the control rate is
+                    1 / (substeps * timestep), 25 Hz by default. The paper's 83.3 Hz and 30 s:
+                    episode_steps=2500, substeps=3, timestep=0.004.
+    action_mode     "delta": joint target = measured angle + 0.3 rad * action;
+                    "absolute": the action spans the joint range.
+    goal_yaw        goal's largest yaw in rad. With 0 rho asks for the position only.
+    reward_weights  weights that replace those of REWARD_WEIGHTS, by name (equation 2, A.1)
+    render_mode     None, "rgb_array" (headless), or "human" (PyBullet's window, in real time)
 
-    info: fractional_success (axis-aligned, as CausalWorld), rewards (each weighted term by name; they add up to the
-    reward); at an episode's last step also fractional_success_strict (oriented) and truncated_by ("time", "a cube left
-    the arena", "the physics diverged": then with the last sound observation, reward 0 and success 0). An episode never
-    terminates: it is truncated, and counts as a success at rho >= 0.8.
+    info holds fractional_success (axis-aligned, as in CausalWorld) and rewards, each weighted term
+    by name; they add up to the reward. At an episode's last step it also holds
+    fractional_success_strict (oriented) and truncated_by: "time", "a cube left the arena", or "the
+    physics diverged" (then with the last sound observation, reward 0 and success 0). An episode
+    never terminates, it is truncated. It counts as solved at rho >= 0.8.
     """
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 25}
 
-    def __init__(self, task="push", distractors=2, *, episode_steps=250, substeps=5, timestep=0.008, action_mode="delta",
-                 goal_yaw=0.0, reward_weights=None, render_mode=None):
-        unknown = set(reward_weights or {}) - set(REWARD_WEIGHTS)
-        for bad, message in (
-                (task not in ("push", "lift"), f"task must be 'push' or 'lift', got {task!r}"),
-                (not isinstance(distractors, (int, np.integer)) or isinstance(distractors, bool) or not 0 <= distractors < len(IDENTIFIERS),
-                 f"the arena holds {len(IDENTIFIERS)} cubes: distractors must be an integer from 0 to {len(IDENTIFIERS) - 1}, got {distractors!r}"),
-                (action_mode not in ("delta", "absolute"), f"action_mode must be 'delta' or 'absolute', got {action_mode!r}"),
-                (unknown, f"reward_weights knows {list(REWARD_WEIGHTS)}, got {sorted(unknown)}"),
-                (episode_steps < 1 or substeps < 1 or not timestep > 0, "episode_steps, substeps and timestep must be positive"),
-                (render_mode not in (None, "rgb_array", "human"), f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}"),
-                (render_mode == "human" and sys.platform == "linux" and not os.environ.get("DISPLAY"),
-                 "render_mode='human' needs a screen (DISPLAY is not set); use 'rgb_array'")):
-            if bad:
-                raise ValueError(message)
-        self.task, self.distractors, self.episode_steps, self.action_mode = task, int(distractors), episode_steps, action_mode
-        self.substeps, self.timestep, self.goal_yaw, self.render_mode = substeps, timestep, goal_yaw, render_mode
+    def __init__(self, task="push", distractors=2, *, episode_steps=125, substeps=5,
+                 timestep=0.008, action_mode="delta", goal_yaw=0.0, reward_weights=None,
+                 render_mode=None):
+        check_arguments(task, distractors, action_mode, reward_weights, render_mode)
+        if episode_steps < 1 or substeps < 1 or not timestep > 0:
+            raise ValueError("episode_steps, substeps and timestep must be positive")
+        self.task, self.distractors = task, int(distractors)
+        self.episode_steps, self.substeps, self.timestep = episode_steps, substeps, timestep
+        self.action_mode, self.goal_yaw = action_mode, goal_yaw
         self.reward_weights = {**REWARD_WEIGHTS, **(reward_weights or {})}
-        self._rng, self._steps = np.random.default_rng(), None
-        self._scale = 1 / np.array(CUBE_SCALE * (self.distractors + 1) + FINGER_SCALE * 3 + GOAL_SCALE, np.float32)
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": round(1 / (substeps * timestep))}
+        self._np_random = np.random.default_rng()              # Gymnasium's name for it
+        self._steps = None                                     # None: reset() has to come first
+        scale = CUBE_SCALE * (self.distractors + 1) + FINGER_SCALE * 3 + GOAL_SCALE
+        self._scale = 1 / np.array(scale, np.float32)
+        if spaces is not None:
+            shapes = {"cubes": (self.distractors + 1, 18), "fingers": (3, 10), "goal": (12,)}
+            self.observation_space = spaces.Dict({
+                key: spaces.Box(-np.inf, np.inf, shape, np.float32)
+                for key, shape in shapes.items()})
+            self.action_space = spaces.Box(-1.0, 1.0, (9,), np.float32)
         self._client = pb.connect(pb.GUI if render_mode == "human" else pb.DIRECT)
+        self._world = {"physicsClientId": self._client}        # last argument of PyBullet's calls
         if render_mode == "human":
-            pb.configureDebugVisualizer(pb.COV_ENABLE_GUI, 0, physicsClientId=self._client)
-            pb.resetDebugVisualizerCamera(0.8, 0, -40, [0, 0, 0.1], physicsClientId=self._client)
+            pb.configureDebugVisualizer(pb.COV_ENABLE_GUI, 0, **self._world)
+            pb.configureDebugVisualizer(pb.COV_ENABLE_SHADOWS, 0, **self._world)
+            pb.resetDebugVisualizerCamera(0.6, 0, -40, [0, 0, 0.1], **self._world)
+
+    # ---- building the world
 
     def _build(self):
         """Make floor, wall, robot, cubes and the goal's picture anew."""
-        c = {"physicsClientId": self._client}
-        pb.resetSimulation(**c)
-        pb.setPhysicsEngineParameter(fixedTimeStep=self.timestep, numSolverIterations=8, deterministicOverlappingPairs=1,
-                                     enableFileCaching=0, **c)             # or each new world keeps a copy of its URDF for ever
-        pb.setGravity(0, 0, -9.81, **c)
+        pb.resetSimulation(**self._world)
+        pb.setPhysicsEngineParameter(
+            fixedTimeStep=self.timestep, numSolverIterations=8, deterministicOverlappingPairs=1,
+            enableFileCaching=0,                               # or every world keeps its URDF
+            **self._world)
+        pb.setGravity(0, 0, -9.81, **self._world)
+        self._draw_window(False)
+        self._build_arena()
+        self._build_robot()
+        self._build_cubes()
+        self._draw_window(True)
 
-        def picture(shape, color, **size):                     # -1: no visual shape, which makes building twice as fast
-            return pb.createVisualShape(shape, rgbaColor=color, **size, **c) if self.render_mode else -1
+    def _draw_window(self, on):
+        """Stop PyBullet's window from drawing every body that is added, or let it draw again."""
+        if self.render_mode == "human":
+            pb.configureDebugVisualizer(pb.COV_ENABLE_RENDERING, int(on), **self._world)
 
-        # useMaximalCoordinates makes a plain rigid body of what would be a one-link multibody: faster to solve.
-        table = picture(pb.GEOM_BOX, [0.97, 0.97, 0.97, 1], halfExtents=[2, 2, 0.5])
-        # A box, not GEOM_PLANE: Bullet finds one contact a step on a plane, and moving cubes sank 6 mm into it.
-        ground = pb.createCollisionShape(pb.GEOM_BOX, halfExtents=[2, 2, 0.5], **c)
-        floor = pb.createMultiBody(0, ground, table, [0, 0, -0.5], useMaximalCoordinates=1, **c)
-        sides = 12
-        edge = (WALL + 0.02) * math.tan(math.pi / sides)
-        wall = pb.createCollisionShape(pb.GEOM_BOX, halfExtents=[0.01, edge, 0.1], **c)
-        rim = picture(pb.GEOM_BOX, [0.6, 0.62, 0.66, 1], halfExtents=[0.01, edge, 0.006], visualFramePosition=[0, 0, -0.094])
-        for a in 2 * math.pi / sides * np.arange(sides):
-            pb.createMultiBody(0, wall, rim, [(WALL + 0.01) * math.cos(a), (WALL + 0.01) * math.sin(a), 0.1],
-                               pb.getQuaternionFromEuler([0, 0, a]), useMaximalCoordinates=1, **c)
+    def _skin(self, color, half_extents, **place):
+        """Visual shape of a box; without pictures -1, none, which makes building twice as fast."""
+        if not self.render_mode:
+            return -1
+        return pb.createVisualShape(pb.GEOM_BOX, halfExtents=half_extents, rgbaColor=color,
+                                    **place, **self._world)
+
+    def _body(self, mass, half_extents, skin, position, quaternion=(0, 0, 0, 1), shape=None):
+        """A box. useMaximalCoordinates: a plain rigid body, which Bullet solves faster."""
+        if shape is None:
+            shape = pb.createCollisionShape(pb.GEOM_BOX, halfExtents=half_extents, **self._world)
+        return pb.createMultiBody(mass, shape, skin, position, quaternion,
+                                  useMaximalCoordinates=1, **self._world)
+
+    def _build_arena(self):
+        # A box, not GEOM_PLANE: Bullet finds one contact a step on a plane, and moving cubes sank.
+        table = [2, 2, 0.5]
+        floor = self._body(0, table, self._skin([0.97, 0.97, 0.97, 1], table), [0, 0, -0.5])
+        pb.changeDynamics(floor, -1, lateralFriction=FRICTION["floor"], **self._world)
+
+        edge = (WALL + 0.02) * math.tan(math.pi / WALL_SIDES)
+        wall = [0.01, edge, 0.1]
+        shape = pb.createCollisionShape(pb.GEOM_BOX, halfExtents=wall, **self._world)
+        rim = self._skin([0.6, 0.62, 0.66, 1], [0.01, edge, 0.006],
+                         visualFramePosition=[0, 0, -0.094])
+        for side in range(WALL_SIDES):
+            angle = 2 * math.pi / WALL_SIDES * side
+            middle = [(WALL + 0.01) * math.cos(angle), (WALL + 0.01) * math.sin(angle), 0.1]
+            quaternion = pb.getQuaternionFromEuler([0, 0, angle])
+            self._body(0, wall, rim, middle, quaternion, shape)
+
+    def _build_robot(self):
+        flags = pb.URDF_USE_INERTIA_FROM_FILE | pb.URDF_USE_SELF_COLLISION
+        if not self.render_mode:
+            flags |= pb.URDF_IGNORE_VISUAL_SHAPES
         with tempfile.TemporaryDirectory() as folder:
             path = os.path.join(folder, "trifinger.urdf")
             with open(path, "w") as file:
                 file.write(robot_urdf())
-            flags = pb.URDF_USE_INERTIA_FROM_FILE | pb.URDF_USE_SELF_COLLISION
-            self._robot = pb.loadURDF(path, useFixedBase=1, flags=flags | (0 if self.render_mode else pb.URDF_IGNORE_VISUAL_SHAPES), **c)
+            self._robot = pb.loadURDF(path, useFixedBase=1, flags=flags, **self._world)
         for j in JOINTS:
-            pb.changeDynamics(self._robot, j, lateralFriction=FRICTION["finger"], linearDamping=0, angularDamping=0, jointDamping=0, **c)
-            if self.render_mode:
-                pb.changeVisualShape(self._robot, j, rgbaColor=[(0.25, 0.25, 0.28, 1), (0.35, 0.35, 0.4, 1), (0.15, 0.15, 0.17, 1)][j % 3], **c)
+            pb.changeDynamics(self._robot, j, lateralFriction=FRICTION["finger"], linearDamping=0,
+                              angularDamping=0, jointDamping=0, **self._world)
+
+    def _build_cubes(self):
         half = [CUBE / 2] * 3
-        shape, skin = pb.createCollisionShape(pb.GEOM_BOX, halfExtents=half, **c), picture(pb.GEOM_BOX, [1, 0, 0, 1], halfExtents=half)
-        self._cubes = [pb.createMultiBody(CUBE_MASS, shape, skin, [0, 0, 1 + i], useMaximalCoordinates=1, **c)
-                       for i in range(self.distractors + 1)]
-        for body, kind in [(floor, "floor")] + [(cube, "cube") for cube in self._cubes]:
-            pb.changeDynamics(body, -1, lateralFriction=FRICTION[kind], **c)
+        shape = pb.createCollisionShape(pb.GEOM_BOX, halfExtents=half, **self._world)
+        skin = self._skin([1, 0, 0, 1], half)
+        self._cubes = []
+        for i in range(self.distractors + 1):
+            cube = self._body(CUBE_MASS, half, skin, [0, 0, 1 + i], shape=shape)
+            pb.changeDynamics(cube, -1, lateralFriction=FRICTION["cube"], **self._world)
+            self._cubes.append(cube)
         if self.render_mode:
-            self._goal_picture = pb.createMultiBody(0, -1, picture(pb.GEOM_BOX, [0.2, 0.8, 0.3, 0.5], halfExtents=half), **c)
+            green = self._skin([0.2, 0.8, 0.3, 0.5], half)
+            self._goal_picture = pb.createMultiBody(0, -1, green, **self._world)
+
+    # ---- the start of an episode
 
     def _place(self):
-        """Draw poses (x, y, yaw) of goal and cubes (N+2, 3): goal, target, then the distractors.
+        """Draw poses (x, y, yaw) of goal, target and distractors, in this order: (N+2, 3).
 
-        Goal and target come first, inside REACH, so that their law is the same for every N; distractors lie anywhere in
-        the arena. Uniform by area, nothing overlaps, nothing lies on the goal or touches a finger. Yaw within 45
-        degrees is every yaw of a cube. Where a crowd has jammed (N near 20), distractors are nudged until a gap opens.
+        Goal and target come first, inside REACH, so that their distribution is the same for all N;
+        distractors lie anywhere in the arena. All uniform by area; nothing overlaps, nothing lies
+        on the goal or touches a finger. Where a crowd has jammed (N near 20), distractors are
+        nudged until a gap opens.
         """
-        def free(new, others):
-            corner = CUBE / math.sqrt(2) * np.exp(1j * (new[:, 2:3] + math.pi / 4 + math.pi / 2 * np.arange(4)))
-            inside = (np.abs(new[:, :1] + 1j * new[:, 1:2] + corner) < WALL - 0.001).all(1)
-            return inside & ~squares_overlap(new, others).any(1)
-
-        placed, size = [[*forward_kinematics(k, REST)[:2], 0.0, 0.014] for k in range(3)], CUBE / 2 + 0.0005
+        fingers = [[*forward_kinematics(k, REST)[:2], 0.0, 0.014] for k in range(3)]
+        placed = fingers.copy()                                # rows: x, y, yaw, half edge
+        fixed = len(fingers) + 2                               # fingers, goal, target stay
         for _ in range(200000):
-            if len(placed) == 5 + self.distractors:
-                return np.array(placed[3:])[:, :3]
-            u = self._rng.random((64, 3))
-            radius = (REACH if len(placed) < 5 else WALL) * np.sqrt(u[:, 0])
-            yaw = self.goal_yaw if len(placed) == 3 else math.pi / 4
-            new = np.stack([radius * np.cos(2 * math.pi * u[:, 1]), radius * np.sin(2 * math.pi * u[:, 1]),
-                            (2 * u[:, 2] - 1) * yaw, np.full(64, size)], 1)
-            ok = free(new, placed)
-            if ok.any():
-                placed.append(new[ok.argmax()])
-            elif len(placed) > 5:
-                moved = placed.pop(int(self._rng.integers(5, len(placed))))
-                new = np.concatenate([moved + self._rng.normal(size=(64, 4)) * [0.01, 0.01, 0.2, 0.0], [moved]])
-                placed.append(new[free(new, placed).argmax()])
+            if len(placed) == fixed + self.distractors:
+                return np.array(placed[len(fingers):])[:, :3]
+            is_goal = len(placed) == len(fingers)
+            radius = REACH if len(placed) < fixed else WALL
+            new = self._draw_squares(radius, self.goal_yaw if is_goal else math.pi / 4)
+            free = self._are_free(new, placed)
+            if free.any():
+                placed.append(new[free.argmax()])
+            elif len(placed) > fixed:
+                some = int(self._np_random.integers(fixed, len(placed)))
+                moved = placed.pop(some)
+                nudge = self._np_random.normal(size=(64, 4)) * [0.01, 0.01, 0.2, 0.0]
+                new = np.concatenate([moved + nudge, [moved]])             # at worst: back again
+                placed.append(new[self._are_free(new, placed).argmax()])
         raise ValueError(f"the arena cannot hold {self.distractors + 1} cubes: no free place found")
+
+    def _draw_squares(self, radius, yaw, count=64):
+        """(count, 4) candidates, uniform in the disc; a yaw within 45 degrees is every yaw."""
+        u = self._np_random.random((count, 3))
+        r = radius * np.sqrt(u[:, 0])                          # uniform by area
+        angle = 2 * math.pi * u[:, 1]
+        half = CUBE / 2 + 0.0005
+        return np.stack([r * np.cos(angle), r * np.sin(angle), (2 * u[:, 2] - 1) * yaw,
+                         np.full(count, half)], axis=1)
+
+    @staticmethod
+    def _are_free(new, placed):
+        """(n,) bool: which squares touch neither the wall nor one that is placed already?"""
+        return corners_inside(new) & ~squares_overlap(new, placed).any(1)
 
     def reset(self, *, seed=None, options=None):
         """Start an episode. Returns (observation, info with fractional_success).
 
-        With a `seed` the generator restarts and the world is built anew (about 5 ms), because moving bodies in place
-        leaves traces in Bullet's caches: two resets with one seed give bit-equal trajectories. Without a seed the
-        bodies are only moved, so an episode then repeats exactly only together with those before it.
+        With a `seed` the generator restarts and the world is built anew (about 5 ms), because
+        moving bodies in place leaves traces in Bullet's caches: two resets with one seed give
+        bit-equal trajectories. Without a seed the bodies are only moved, so an episode then
+        repeats exactly only together with those before it. `options` are ignored.
         """
         if seed is not None:
-            self._rng = np.random.default_rng(seed)
+            self._np_random = np.random.default_rng(seed)
+            self._np_random_seed = seed
         if seed is not None or self._steps is None:
             self._build()
-        c = {"physicsClientId": self._client}
-        poses = self._place()
-        count = self.distractors + 1
-        self.target = int(self._rng.integers(count))
-        self._ids = self._rng.choice(IDENTIFIERS, count, replace=False).tolist()
-        height = float(self._rng.uniform(CUBE / 2, 0.2)) if self.task == "lift" else CUBE / 2
-        x, y, yaw = poses[0].tolist()
-        self.goal = ((x, y, height), (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
-        self._goal_row = (1.0, CUBE, CUBE, CUBE, *self.goal[0], *self.goal[1], self._ids[self.target])
-        order = list(range(2, count + 1))
-        order.insert(self.target, 1)
-        for cube, (x, y, yaw) in zip(self._cubes, poses[order]):
-            pb.resetBasePositionAndOrientation(cube, [x, y, CUBE / 2], [0, 0, math.sin(yaw / 2), math.cos(yaw / 2)], **c)
-            pb.resetBaseVelocity(cube, [0, 0, 0], [0, 0, 0], **c)
+        goal, *cubes = self._place().tolist()
+        count = len(cubes)
+        self.target = int(self._np_random.integers(count))
+        self._ids = self._np_random.choice(IDENTIFIERS, count, replace=False).tolist()
+        height = CUBE / 2
+        if self.task == "lift":
+            height = float(self._np_random.uniform(CUBE / 2, 0.2))
+        self._set_goal(goal, height)
+        target, *poses = cubes
+        poses.insert(self.target, target)
+        for cube, (x, y, yaw) in zip(self._cubes, poses):
+            pb.resetBasePositionAndOrientation(cube, [x, y, CUBE / 2], yaw_quaternion(yaw),
+                                               **self._world)
+            pb.resetBaseVelocity(cube, [0, 0, 0], [0, 0, 0], **self._world)
         for j in JOINTS:
-            pb.resetJointState(self._robot, j, REST[j % 3], 0.0, **c)
+            pb.resetJointState(self._robot, j, REST[j % 3], 0.0, **self._world)
         self._steps = 0
         if self.render_mode:
             self._paint()
         self._read()
-        observation = self._observe()
-        self._distances = self._measure()
-        return observation, {"fractional_success": self._rho}
+        self._moment = self._measure()
+        return self._observe(), {"fractional_success": self._moment.rho}
+
+    def _set_goal(self, pose, height):
+        x, y, yaw = pose
+        self.goal = (x, y, height), yaw_quaternion(yaw)
+        position, quaternion = self.goal
+        identifier = self._ids[self.target]
+        self._goal_row = (1.0, CUBE, CUBE, CUBE, *position, *quaternion, identifier)
+
+    # ---- a step
 
     def step(self, action):
-        """Apply action (9,) in [-1, 1] (beyond: clipped). Returns (observation, reward, terminated, truncated, info).
+        """Apply action (9,) in [-1, 1] (beyond: clipped).
 
-        ValueError for an action that is not nine finite numbers; RuntimeError before the first reset.
+        Returns (observation, reward, terminated, truncated, info). ValueError for an action that
+        is not nine finite numbers; RuntimeError before the first reset.
         """
         if self._steps is None:
             raise RuntimeError("call reset() before step()")
-        try:
-            action = np.asarray(action, dtype=np.float64)
-        except (TypeError, ValueError):
-            action = np.array(np.nan)
-        if action.shape != (9,) or not all(map(math.isfinite, action.tolist())):
-            raise ValueError(f"action must be nine finite numbers, shape (9,), got {action!r}")
-        action = clip(action.tolist(), (-1.0,) * 9, (1.0,) * 9)
-        if self.action_mode == "delta":
-            targets = [q + 0.3 * a for q, a in zip(self._q, action)]
-        else:
-            targets = [low + (high - low) * (a + 1) / 2 for a, low, high in zip(action, LOWER * 3, UPPER * 3)]
-        c = self._client                                       # passed by place below: keywords cost time at each call
-        pb.setJointMotorControlArray(self._robot, JOINTS, pb.POSITION_CONTROL, targetPositions=clip(targets, LOWER * 3, UPPER * 3),
-                                     forces=(TORQUE,) * 9, physicsClientId=c)
-        for _ in range(self.substeps):
-            pb.stepSimulation(c)
+        self._drive(self._joint_targets(nine_numbers(action)))
         self._steps += 1
-        reason = self._read() or ("time" if self._steps >= self.episode_steps else None)
-        if reason == "the physics diverged":                   # show the last sound observation; the next reset builds anew
-            self._steps = None
-            return self._seen, 0.0, False, True, {"fractional_success": 0.0, "fractional_success_strict": 0.0, "truncated_by": reason,
-                                                  "rewards": dict.fromkeys(self.reward_weights, 0.0)}
-        observation = self._observe()
-        last, last_to_goal, last_to_tips = self._distances
-        position, to_goal, to_tips = self._distances = self._measure()
-        rho, w = self._rho, self.reward_weights
-        rewards = {"overlap": w["overlap"] * rho,
-                   "distance": w["distance"] * (last_to_goal - to_goal),
-                   "curiosity": w["curiosity"] * (1 - rho) ** 0.05 * math.log(math.dist(position, last) + 1e-5),
-                   "reach": w["reach"] * (last_to_tips - to_tips)}
-        info = {"fractional_success": rho, "rewards": rewards}
-        if reason:
-            info["truncated_by"], info["fractional_success_strict"] = reason, oriented_overlap(self._poses[self.target], self.goal)
+        reason = self._read()
+        if reason == "the physics diverged":
+            return self._diverged(reason)
+        if reason is None and self._steps >= self.episode_steps:
+            reason = "time"
+        before, self._moment = self._moment, self._measure()
+        rewards = self._rewards(before, self._moment)
+        info = {"fractional_success": self._moment.rho, "rewards": rewards}
+        if reason is not None:
+            info["truncated_by"] = reason
+            strict = oriented_overlap(self._poses[self.target], self.goal)
+            info["fractional_success_strict"] = strict
         if self.render_mode == "human":
             time.sleep(self.substeps * self.timestep)
-        return observation, sum(rewards.values()), False, reason is not None, info
+        return self._observe(), sum(rewards.values()), False, reason is not None, info
+
+    def _joint_targets(self, action):
+        """Angles (9,) in rad that an action asks the joints for."""
+        if self.action_mode == "delta":
+            targets = [q + DELTA * a for q, a in zip(self._q, action)]
+        else:                                                  # from [-1, 1] to the joint range
+            targets = [low + (high - low) * (a + 1) / 2
+                       for a, low, high in zip(action, LOWER * 3, UPPER * 3)]
+        return clip(targets, LOWER * 3, UPPER * 3)
+
+    def _drive(self, targets):
+        """Let the physics run for one action with the joints drawn to `targets`."""
+        pb.setJointMotorControlArray(self._robot, JOINTS, pb.POSITION_CONTROL,
+                                     targetPositions=targets, forces=(TORQUE,) * 9, **self._world)
+        client = self._client                                  # by place: keywords cost time
+        for _ in range(self.substeps):
+            pb.stepSimulation(client)
 
     def _read(self):
-        """Read joints and cubes from the simulator. Returns a reason to cut the episode short, or None."""
-        c, reason, flat, self._poses = self._client, None, [], []
-        self._q, self._dq, _, _ = zip(*pb.getJointStates(self._robot, JOINTS, c))
+        """Read joints and cubes from the simulator. Returns a reason to cut the episode short."""
+        client, reason = self._client, None
+        states = pb.getJointStates(self._robot, JOINTS, client)
+        self._q, self._dq, _, _ = zip(*states)
+        self._poses, rows = [], []
         for cube, identifier in zip(self._cubes, self._ids):
-            (x, y, z), turn = pose = pb.getBasePositionAndOrientation(cube, c)
-            linear, angular = pb.getBaseVelocity(cube, c)
+            pose = pb.getBasePositionAndOrientation(cube, client)
+            linear, angular = pb.getBaseVelocity(cube, client)
             self._poses.append(pose)
-            if turn[3] < 0:                                    # q and -q are the same turn: show one of them
-                turn = (-turn[0], -turn[1], -turn[2], -turn[3])
-            flat += (1.0, CUBE, CUBE, CUBE, x, y, z, *turn, *linear, *angular, identifier)
+            (x, y, z), quaternion = pose
+            if quaternion[3] < 0:                              # q and -q are one turn: show one
+                quaternion = tuple(-value for value in quaternion)
+            rows += (1.0, CUBE, CUBE, CUBE, x, y, z, *quaternion, *linear, *angular, identifier)
             if not (x * x + y * y < (WALL + 0.03) ** 2 and -0.03 < z < 1.0):
                 reason = "a cube left the arena"
-        self._rows = flat
-        # rad/s; full speed of all joints is about 80. Written so that NaN fails it.
-        return reason if math.isfinite(sum(flat)) and sum(map(abs, self._dq)) < 1000 else "the physics diverged"
-
-    def _observe(self):
-        """The observation of Table 1 from what _read() read, scaled, in fresh arrays; also tips and rho."""
-        split, q, dq = len(self._rows), self._q, self._dq
-        self._tips = a, b, d = [forward_kinematics(k, q[3 * k:3 * k + 3]) for k in range(3)]
-        flat = (*self._rows, *q[:3], *dq[:3], -1.0, *a, *q[3:6], *dq[3:6], 0.0, *b, *q[6:], *dq[6:], 1.0, *d, *self._goal_row)
-        flat = np.array(flat, np.float32) * self._scale
-        self._rho = aabb_overlap(self._poses[self.target], self.goal)
-        self._seen = {"cubes": flat[:split].reshape(-1, 18), "fingers": flat[split:-12].reshape(3, 10), "goal": flat[-12:]}
-        return self._seen
+        self._cube_rows = rows
+        # Full speed of all joints adds up to about 80 rad/s. Written so that NaN fails it.
+        if math.isfinite(sum(rows)) and sum(map(abs, self._dq)) < 1000:
+            return reason
+        return "the physics diverged"
 
     def _measure(self):
-        """Target cube's position, its distance to the goal, and the Frobenius norm of (fingertips - cube); all in m."""
-        position, (a, b, c) = self._poses[self.target][0], self._tips
-        return (position, math.dist(position, self.goal[0]),
-                math.hypot(math.dist(a, position), math.dist(b, position), math.dist(c, position)))
+        """The Moment of what _read() read."""
+        q = self._q
+        tips = [forward_kinematics(k, q[3 * k:3 * k + 3]) for k in range(3)]
+        pose = self._poses[self.target]
+        position = pose[0]
+        a, b, c = tips
+        to_tips = math.hypot(math.dist(a, position), math.dist(b, position), math.dist(c, position))
+        to_goal = math.dist(position, self.goal[0])
+        return Moment(tips, position, aabb_overlap(pose, self.goal), to_goal, to_tips)
+
+    def _observe(self):
+        """The observation of Table 1 from what _read() read, scaled, in fresh arrays."""
+        q, dq = self._q, self._dq
+        a, b, c = self._moment.tips
+        flat = (*self._cube_rows,                              # (N+1) x 18
+                *q[:3], *dq[:3], -1.0, *a,                     # 3 x 10: q dq identifier tip
+                *q[3:6], *dq[3:6], 0.0, *b,
+                *q[6:], *dq[6:], 1.0, *c,
+                *self._goal_row)                               # 12
+        flat = np.array(flat, np.float32) * self._scale
+        split = len(self._cube_rows)
+        self._last_observation = {
+            "cubes": flat[:split].reshape(-1, 18),
+            "fingers": flat[split:-12].reshape(3, 10),
+            "goal": flat[-12:],
+        }
+        return self._last_observation
+
+    def _rewards(self, before, now):
+        """Equation 2 (A.1) term by term, weighted; "reach" is ours.
+
+            overlap     rho_t
+            distance    d(o_{t-1}, g) - d(o_t, g): pays for moving closer (printed with a minus)
+            curiosity   (1 - rho_t)^beta log(d(o_t, o_{t-1}) + 1e-5)
+            reach       ||tips_{t-1} - o_{t-1}|| - ||tips_t - o_t||: pays for tips nearer the cube
+        """
+        weights = self.reward_weights
+        moved = math.dist(now.position, before.position)
+        far = (1 - now.rho) ** BETA                            # about 1 until the cube is there
+        return {
+            "overlap": weights["overlap"] * now.rho,
+            "distance": weights["distance"] * (before.to_goal - now.to_goal),
+            "curiosity": weights["curiosity"] * far * math.log(moved + 1e-5),
+            "reach": weights["reach"] * (before.to_tips - now.to_tips),
+        }
+
+    def _diverged(self, reason):
+        """Last step of an episode whose state is no longer numbers: the next reset builds anew."""
+        self._steps = None
+        info = {"fractional_success": 0.0, "fractional_success_strict": 0.0,
+                "truncated_by": reason, "rewards": dict.fromkeys(self.reward_weights, 0.0)}
+        return self._last_observation, 0.0, False, True, info
+
+    # ---- pictures
 
     def _paint(self):
-        """Move the goal's picture and colour the cubes: target blue, distractors red (Figure 1)."""
-        c = {"physicsClientId": self._client}
+        """Move the goal's picture and colour the cubes: target blue, distractors red (figure 1)."""
         for i, cube in enumerate(self._cubes):
-            pb.changeVisualShape(cube, -1, rgbaColor=[0.15, 0.35, 0.9, 1] if i == self.target else [0.85, 0.2, 0.2, 1], **c)
-        pb.resetBasePositionAndOrientation(self._goal_picture, *self.goal, **c)
+            color = [0.15, 0.35, 0.9, 1] if i == self.target else [0.85, 0.2, 0.2, 1]
+            pb.changeVisualShape(cube, -1, rgbaColor=color, **self._world)
+        self._show_goal(*self.goal)
+
+    def _show_goal(self, position, quaternion=(0, 0, 0, 1)):
+        pb.resetBasePositionAndOrientation(self._goal_picture, position, quaternion, **self._world)
 
     def render(self, width=480, height=360):
-        """RGB picture (height, width, 3) uint8 of the arena, drawn on the CPU (TinyRenderer); needs no screen."""
+        """RGB picture (height, width, 3) uint8 of the arena, drawn on the CPU; needs no screen.
+
+        RuntimeError without a render_mode or before the first reset.
+        """
         if self._steps is None or not self.render_mode:
             raise RuntimeError("render() needs render_mode='rgb_array' and a reset() first")
+        with_goal = self._shot(width, height)                  # TinyRenderer knows no transparency:
+        self._show_goal([0, 0, -1])                            # blend two pictures
+        without_goal = self._shot(width, height)
+        self._show_goal(*self.goal)
+        return (0.5 * with_goal + 0.5 * without_goal).astype(np.uint8)
+
+    def _shot(self, width, height):
         view = pb.computeViewMatrix([0.0, -0.72, 0.62], [0, 0, 0.1], [0, 0, 1])
         lens = pb.computeProjectionMatrixFOV(45, width / height, 0.05, 3)
-
-        def shot():
-            image = pb.getCameraImage(width, height, view, lens, shadow=1, lightDirection=[0.5, -1, 2],
-                                      renderer=pb.ER_TINY_RENDERER, physicsClientId=self._client)[2]
-            return np.reshape(image, (height, width, 4))[:, :, :3].astype(np.float32)
-
-        image = shot()                                         # TinyRenderer knows no transparency: blend two pictures
-        pb.resetBasePositionAndOrientation(self._goal_picture, [0, 0, -1], [0, 0, 0, 1], physicsClientId=self._client)
-        image = 0.5 * image + 0.5 * shot()
-        pb.resetBasePositionAndOrientation(self._goal_picture, *self.goal, physicsClientId=self._client)
-        return image.astype(np.uint8)
+        _, _, image, _, _ = pb.getCameraImage(
+            width, height, view, lens, shadow=1, lightDirection=[0.5, -1, 2],
+            renderer=pb.ER_TINY_RENDERER, **self._world)
+        return np.reshape(image, (height, width, 4))[:, :, :3].astype(np.float32)
 
     def close(self):
         """Disconnect from PyBullet; calling it twice is harmless."""
@@ -435,37 +693,83 @@ class TriFingerEnv:
             self._client = None
 
 
-def speed_table(episodes=21, steps=100):
-    """Frames/s under random actions, times the bare physics that a step takes and times a step that a reset takes.
+def check_arguments(task, distractors, action_mode, reward_weights, render_mode):
+    """ValueError with one line if TriFingerEnv cannot be built from these."""
+    most = len(IDENTIFIERS) - 1
+    is_integer = isinstance(distractors, (int, np.integer)) and not isinstance(distractors, bool)
+    unknown = set(reward_weights or {}) - set(REWARD_WEIGHTS)
+    if task not in ("push", "lift"):
+        raise ValueError(f"task must be 'push' or 'lift', got {task!r}")
+    if not is_integer or not 0 <= distractors <= most:
+        raise ValueError(f"the arena holds {most + 1} cubes: distractors must be an integer from 0 "
+                         f"to {most}, got {distractors!r}")
+    if action_mode not in ("delta", "absolute"):
+        raise ValueError(f"action_mode must be 'delta' or 'absolute', got {action_mode!r}")
+    if unknown:
+        raise ValueError(f"reward_weights knows {list(REWARD_WEIGHTS)}, got {sorted(unknown)}")
+    if render_mode not in (None, "rgb_array", "human"):
+        raise ValueError(f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}")
+    if render_mode == "human" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        raise ValueError("a window needs a screen, and DISPLAY is not set; use 'rgb_array'")
 
-    Medians over episodes. The bare physics is timed inside the very same steps, by wrapping stepSimulation.
+
+def nine_numbers(action):
+    """The action as nine floats in [-1, 1]; ValueError if it is not nine finite numbers."""
+    try:
+        action = np.asarray(action, dtype=np.float64)
+    except (TypeError, ValueError):
+        action = np.array(np.nan)
+    numbers = action.tolist()
+    if action.shape != (9,) or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"action must be nine finite numbers, shape (9,), got {action!r}")
+    return clip(numbers, (-1.0,) * 9, (1.0,) * 9)
+
+
+# ---- speed
+
+def timed_episode(env, actions, physics):
+    """Seconds of an unseeded reset and of all steps together."""
+    clock = time.perf_counter
+    start = clock()
+    env.reset()
+    reset = clock() - start
+    physics.clear()
+    spent = 0.0
+    for action in actions:
+        start = clock()
+        env.step(action)
+        spent += clock() - start
+    return reset, spent
+
+
+def speed_table(episodes=21, steps=100):
+    """Frames/s under random actions, medians over episodes.
+
+    "step/physics": the time of step() over that of the bare stepSimulation inside the very same
+    steps. "reset/step": a reset counted in steps.
     """
-    bare, clock, physics = pb.stepSimulation, time.perf_counter, []
+    bare, physics = pb.stepSimulation, []
 
     def timed(client):
-        start = clock()
+        start = time.perf_counter()
         bare(client)
-        physics.append(clock() - start)
+        physics.append(time.perf_counter() - start)
 
-    pb.stepSimulation, rng = timed, np.random.default_rng(0)
+    pb.stepSimulation = timed
+    rng = np.random.default_rng(0)
     print("   N  control        frames/s  step/physics  reset/step")
     for substeps, timestep in ((5, 0.008), (3, 0.004)):
         for distractors in (0, 2, 5, 9):
-            env, rows = TriFingerEnv(distractors=distractors, substeps=substeps, timestep=timestep), []
+            env = TriFingerEnv(distractors=distractors, substeps=substeps, timestep=timestep)
             env.reset(seed=0)
+            rows = []
             for actions in rng.uniform(-1, 1, (episodes, steps, 9)):
-                start = clock()
-                env.reset()
-                reset, spent = clock() - start, 0.0
-                physics.clear()
-                for action in actions:
-                    start = clock()
-                    env.step(action)
-                    spent += clock() - start
+                reset, spent = timed_episode(env, actions, physics)
                 rows.append((steps / spent, spent / sum(physics), reset / spent * steps))
             env.close()
-            rate, share, reset = np.median(rows, 0)
-            print(f"{distractors:4d}  {substeps} x {1000 * timestep:.0f} ms {rate:13.0f} {share:13.2f} {reset:11.1f}")
+            rate, share, resets = np.median(rows, axis=0)
+            print(f"{distractors:4d}  {substeps} x {1000 * timestep:.0f} ms {rate:13.0f} "
+                  f"{share:13.2f} {resets:11.1f}")
     pb.stepSimulation = bare
 
 

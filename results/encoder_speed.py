@@ -1,0 +1,51 @@
+"""How long do LRN and RN take for K objects?
+
+    python results/encoder_speed.py                      forward and backward pass, a minute
+    python results/encoder_speed.py --repeats 1
+
+Median CPU time over the repeats, one thread, 64 samples, D = 64. The slope is that of log(time)
+over log(K): 1 is linear, 2 quadratic. RN stops at 48 objects, where it has 2401 pairs a sample.
+"""
+import argparse
+import os
+import sys
+import time
+
+import numpy as np
+import torch
+
+sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+from lrn import LRN
+from rn import RN
+
+B, D = 64, 64
+
+
+def milliseconds(encoder, K, repeats):
+    """Median time of a forward and backward pass on K objects."""
+    objects = torch.randn(B, K, D, requires_grad=True)
+    goal = torch.randn(B, D)
+    times = []
+    for _ in range(repeats + 1):         # the first one warms up
+        start = time.process_time()
+        encoder(objects, goal).sum().backward()
+        times.append(time.process_time() - start)
+    return 1000 * np.median(times[1:])
+
+
+def main():
+    parser = argparse.ArgumentParser(description="How the encoders' time grows with K.")
+    parser.add_argument("--repeats", type=int, default=25, metavar="R")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    numbers = {LRN: (12, 24, 48, 96, 192), RN: (12, 24, 48)}
+    for kind in (LRN, RN):
+        times = [milliseconds(kind(), K, args.repeats) for K in numbers[kind]]
+        slope, _ = np.polyfit(np.log(numbers[kind]), np.log(times), 1)
+        shown = ", ".join(f"K={K} {ms:.2f} ms" for K, ms in zip(numbers[kind], times))
+        print(f"{kind.__name__}: {shown}; slope {slope:.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,233 @@
+"""Draw the figures and print the tables of this folder from the CSV files of its runs.
+
+    python results/figures.py              every figure: results/figure3.png
+    python results/figures.py 3            one of them
+    python results/figures.py table        the tables, in markdown
+    python results/figures.py 3 --out .    into another folder
+
+Figures have the numbers of the paper's. Needs matplotlib (the tables do not).
+"""
+import argparse
+import csv
+import glob
+import os
+import re
+import sys
+from typing import NamedTuple
+
+import numpy as np
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+MEASURES = {                             # column of zeroshot.csv -> title of its table
+    "success_aabb": "axis-aligned",
+    "success_strict": "strict",
+    "solved": "solved",
+}
+# Student's t for a 95 % interval, by the number of seeds
+STUDENT = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776}
+GROUPS = ("push-lrn-n2", "push-lrn-max-n2", "push-rn-n2", "push-attn-n2", "push-mlp-n2",
+          "push-lrn-n9", "push-lrn-max-n9")
+LINES = {                                # of figure 3: group -> label, colour
+    "push-lrn-n2": ("LRN", "#0072B2"),
+    "push-lrn-max-n2": ("LRN-max (ours)", "#E69F00"),
+    "push-rn-n2": ("RN", "#009E73"),
+    "push-attn-n2": ("ATTN", "#CC3311"),
+}
+WINDOW = 50                              # updates that a point of a training curve averages
+
+
+# ---- reading
+
+def fail(message):
+    """End with one line and status 2."""
+    print(f"figures.py: error: {message}", file=sys.stderr)
+    sys.exit(2)
+
+
+def read(run, name):
+    """Columns of a CSV of a run folder as float arrays; ValueError if it is missing or empty."""
+    path = os.path.join(run, name)
+    try:
+        with open(path, newline="") as file:
+            rows = list(csv.DictReader(file))
+        return {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
+    except (OSError, IndexError, TypeError, ValueError):
+        raise ValueError(f"{path} is missing or not a CSV of this project") from None
+
+
+def shipped_runs():
+    """Run folders of GROUPS in this folder, seed by seed."""
+    return [run for name in GROUPS for run in sorted(glob.glob(f"{HERE}/{name}-seed?"))]
+
+
+def by_seed(runs):
+    """Runs that differ only in the seed, together: {"push-lrn-n2": [folder, ...]}."""
+    groups = {}
+    for run in runs:
+        name = os.path.basename(os.path.normpath(run))
+        group = re.sub(r"-seed\d+$", "", name)
+        groups.setdefault(group, []).append(run)
+    return groups
+
+
+# ---- several seeds at one N
+
+class Cell(NamedTuple):
+    """A measure at one N."""
+    values: np.ndarray                   # each seed's mean over its episodes, (S,)
+    bar: float                           # half width of the 95 % interval over all episodes
+    half: float                          # of that over seeds; with one seed the same as `bar`
+
+
+def bar_of(rows, i, measure):
+    """Half width of the 95 % interval over episodes in row i of a zeroshot.csv."""
+    if measure == "success_aabb":
+        return rows["ci95"][i]
+    if measure == "success_strict":
+        return rows["ci95_strict"][i]
+    share = rows["solved"][i]            # of a share p: 1.96 sqrt(p (1 - p) / n)
+    return 1.96 * np.sqrt(share * (1 - share) / rows["episodes"][i])
+
+
+def cell(values, bars):
+    """Cell of the seeds' means and of their intervals' half widths."""
+    values, bars = np.array(values), np.array(bars)
+    S = len(values)
+    bar = np.sqrt(np.square(bars).sum()) / S
+    if S == 1:
+        return Cell(values, bar, bar)
+    half = STUDENT.get(S, 2.5) * values.std(ddof=1) / np.sqrt(S)
+    return Cell(values, bar, half)
+
+
+def over_seeds(runs, measure):
+    """{N: Cell} of a measure over runs that differ in the seed alone."""
+    values, bars = {}, {}
+    for run in runs:
+        rows = read(run, "zeroshot.csv")
+        for i, n in enumerate(rows["distractors"].astype(int).tolist()):
+            values.setdefault(n, []).append(rows[measure][i])
+            bars.setdefault(n, []).append(bar_of(rows, i, measure))
+    return {n: cell(values[n], bars[n]) for n in sorted(values)}
+
+
+# ---- tables
+
+def cell_text(cell):
+    """'0.80 ± 0.25' and, for several seeds, each of them on a second line."""
+    text = f"{cell.values.mean():.2f} ± {cell.half:.2f}"
+    if len(cell.values) > 1:
+        text += "<br>" + ", ".join(f"{value:.2f}" for value in cell.values)
+    return text
+
+
+def cost_texts(runs):
+    """Cells that say what the runs cost: how many, million frames, minutes of each."""
+    timings = [read(run, "timing.csv") for run in runs]
+    frames = np.mean([timing["frames"][-1] for timing in timings]) / 1e6
+    minutes = [f"{timing['seconds'][-1] / 60:.0f}" for timing in timings]
+    return [str(len(runs)), f"{frames:.1f}", ", ".join(minutes)]
+
+
+def line_of(cells):
+    return "| " + " | ".join(cells) + " |"
+
+
+def table(runs, measure):
+    """Lines of the markdown table of one measure: a row for each group of runs."""
+    groups = by_seed(runs)
+    columns = {name: over_seeds(members, measure) for name, members in groups.items()}
+    numbers = sorted({n for cells in columns.values() for n in cells})
+    head = [MEASURES[measure], "seeds", "million frames", "minutes"]
+    lines = [line_of(head + [f"N = {n}" for n in numbers]),
+             "|---" * (len(head) + len(numbers)) + "|"]
+    for name, cells in columns.items():
+        shown = [cell_text(cells[n]) if n in cells else "-" for n in numbers]
+        lines.append(line_of([name, *cost_texts(groups[name]), *shown]))
+    return lines
+
+
+def print_tables(runs):
+    for measure in MEASURES:
+        print("\n".join(table(runs, measure)), end="\n\n")
+
+
+# ---- figures
+
+def pyplot():
+    """matplotlib.pyplot without a window."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise ValueError("figures need matplotlib: pip install matplotlib") from None
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+    pyplot.rcParams.update({"font.size": 10, "axes.grid": True, "grid.alpha": 0.3})
+    return pyplot
+
+
+def smooth(values):
+    """Mean of each WINDOW updates."""
+    return np.convolve(values, np.ones(WINDOW) / WINDOW, "valid")
+
+
+def draw(axes, x, curves, label, color, marker=None):
+    """The mean of curves (S, points), and a band from the lowest to the highest of them."""
+    axes.plot(x, np.mean(curves, axis=0), color=color, label=label, marker=marker, markersize=4)
+    lowest, highest = np.min(curves, axis=0), np.max(curves, axis=0)
+    axes.fill_between(x, lowest, highest, color=color, alpha=0.15, linewidth=0)
+
+
+def figure_3(folder):
+    """Figure 3, upper half: training at 2 distractors (left), zero-shot at others (right)."""
+    plt = pyplot()
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
+    groups = by_seed(shipped_runs())
+    for name, (label, color) in LINES.items():
+        runs = groups[name]
+        label += f", {len(runs)} seeds" if len(runs) > 1 else ", 1 seed"
+        progress = [read(run, "progress.csv") for run in runs]
+        frames = progress[0]["frames"][WINDOW - 1:] / 1e6
+        draw(left, frames, [smooth(rows["success_aabb"]) for rows in progress], label, color)
+        cells = over_seeds(runs, "success_aabb")
+        values = np.array([cells[n].values for n in cells]).T              # (S, numbers)
+        draw(right, list(cells), values, label, color, marker="o")
+    left.set(title="PushingCube: training at N = 2", xlabel="million frames",
+             ylabel="fractional success (axis-aligned)", ylim=(0, 1))
+    right.set(title="PushingCube: zero-shot", xlabel="N, distractors at test time", ylim=(0, 1),
+              xticks=[0, 2, 5, 9, 14, 19])
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    save(figure, folder, "figure3.png")
+
+
+def save(figure, folder, name):
+    path = os.path.join(folder, name)
+    figure.savefig(path, dpi=150)
+    print(f"wrote {path}")
+
+
+FIGURES = {"3": figure_3}                # number in the paper -> function
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description="Figures and tables of the shipped runs (see the first lines of figures.py).")
+    parser.error = fail
+    parser.add_argument("what", nargs="*", help=f"{', '.join(FIGURES)} or table (default: figures)")
+    parser.add_argument("--out", default=HERE, metavar="DIR", help="folder (default results)")
+    args = parser.parse_args()
+    for what in args.what:
+        if what not in FIGURES and what != "table":
+            fail(f"there is no figure {what}; there are {', '.join(FIGURES)} and table")
+    try:
+        for what in args.what or FIGURES:
+            if what == "table":
+                print_tables(shipped_runs())
+            else:
+                FIGURES[what](args.out)
+    except (ValueError, OSError) as error:
+        fail(str(error))
+
+
+if __name__ == "__main__":
+    main()
