@@ -2075,9 +2075,9 @@ def test_columns_about_episodes_by_hand():
 
     sums = train.episode_sums([
         episode(10.0, 50, 0.8, 0.7, "time"), episode(-4.0, 20, 0.79, 0.1, "a cube left the arena"),
-        episode(0.0, 50, 1.0, 0.9, "time"), episode(6.0, 8, 0.0, 0.0, "the physics diverged")])
+        episode(0.0, 50, 1.0, 0.9, "time"), episode(6.0, 8, 0.0, 0.0, "time")])
     expected = {"episodes": 4, "return": 3.0, "length": 32.0, "success_aabb": 2.59 / 4,
-                "success_strict": 1.7 / 4, "solved": 0.5, "cut_short": 2}
+                "success_strict": 1.7 / 4, "solved": 0.5, "cut_short": 1}
     assert train.summarize(sums) == pytest.approx(expected)
     nothing = train.summarize(train.episode_sums([]))
     assert nothing["episodes"] == 0 and math.isnan(nothing["return"])
@@ -2556,14 +2556,29 @@ class Simple(nn.Module):
         return torch.tensor([1.5, 0.5, 0.0]).expand(len(z), 3)
 
 
+class Touchy(TriFingerEnv):
+    """Its success depends on every action of an episode, also where no cube is touched."""
+
+    def reset(self, **options):
+        self.felt = 0.0
+        return super().reset(**options)
+
+    def step(self, action):
+        *result, info = super().step(action)
+        self.felt = 0.9 * self.felt + np.sum(action) / 100
+        info["fractional_success"] += self.felt
+        return *result, info
+
+
 @pytest.fixture
 def simple(monkeypatch):
-    """A run "simple", trained with 1 distractor, whose agent is Simple."""
+    """A run "simple", trained with 1 distractor, whose agent is Simple and whose world Touchy."""
     settings = {**train.DEFAULTS, "episode_steps": 15, "goal_yaw": 0.4}
     checkpoint = {"task": "push", "distractors": 1, "encoder": "lrn", "frames": 7,
                   "settings": settings}
     agent = Simple()
     monkeypatch.setattr(evaluate, "load", lambda path: (checkpoint, agent))
+    monkeypatch.setattr(train, "TriFingerEnv", Touchy)
     evaluate.trained_z.cache_clear()
     yield checkpoint
     evaluate.trained_z.cache_clear()
@@ -2601,7 +2616,7 @@ def test_play_equals_a_plain_loop_over_episodes(simple, n, mean_actions):
     assert [episode.cut_short for episode in ours] == [False] * 6
     assert [episode.drift for episode in ours] == [pytest.approx(0, abs=1e-6)] * 6     # the goal's
     assert len(set(expected[:, 2])) == 6                       # six different starts
-    assert all(episode.rho != episode.strict for episode in ours if episode.rho)
+    assert all(abs(episode.rho - episode.strict) > 1e-3 for episode in ours)
 
 
 def test_an_agent_without_read_out_has_no_read_error(simple):
@@ -2866,6 +2881,7 @@ def test_scripts_of_results_run(script, trained):
         assert word in done.stdout
 
 
+@pytest.mark.skipif(not SLOW, reason="takes a minute: SLOW=1")
 def test_comparison_with_stable_baselines_runs():
     pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed (optional)")
     done = run("results/against_sb3.py", "--updates", "1", "--envs", "8", timeout=300)
