@@ -710,7 +710,7 @@ def check_arguments(task, distractors, action_mode, reward_weights, render_mode)
     if render_mode not in (None, "rgb_array", "human"):
         raise ValueError(f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}")
     if render_mode == "human" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        raise ValueError("a window needs a screen, and DISPLAY is not set; use 'rgb_array'")
+        raise ValueError("a window needs a screen, and DISPLAY is not set; 'rgb_array' needs none")
 
 
 def nine_numbers(action):
