@@ -134,8 +134,8 @@ def aabb_overlap(cube, goal):
     cube only makes its box larger.
     """
     share = 1.0
-    halves = zip(aabb_half_extents(cube[1]), aabb_half_extents(goal[1]))
-    for at_cube, at_goal, (half_cube, half_goal) in zip(cube[0], goal[0], halves):
+    halves = aabb_half_extents(cube[1]), aabb_half_extents(goal[1])
+    for at_cube, at_goal, half_cube, half_goal in zip(cube[0], goal[0], *halves):
         low = max(at_cube - half_cube, at_goal - half_goal)
         high = min(at_cube + half_cube, at_goal + half_goal)
         share *= max(high - low, 0.0) / (2 * half_goal)
@@ -587,10 +587,10 @@ class TriFingerEnv(Env):
             pose = pb.getBasePositionAndOrientation(cube, client)
             linear, angular = pb.getBaseVelocity(cube, client)
             self._poses.append(pose)
-            (x, y, z), quaternion = pose
-            if quaternion[3] < 0:                              # q and -q are one turn: show one
-                quaternion = tuple(-value for value in quaternion)
-            rows += (1.0, CUBE, CUBE, CUBE, x, y, z, *quaternion, *linear, *angular, identifier)
+            (x, y, z), (qx, qy, qz, qw) = pose
+            if qw < 0:                                         # q and -q are one turn: show one
+                qx, qy, qz, qw = -qx, -qy, -qz, -qw
+            rows += (1.0, CUBE, CUBE, CUBE, x, y, z, qx, qy, qz, qw, *linear, *angular, identifier)
             if not (x * x + y * y < (WALL + 0.03) ** 2 and -0.03 < z < 1.0):
                 reason = "a cube left the arena"
         self._cube_rows = rows
