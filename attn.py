@@ -1,14 +1,15 @@
 """Self-attention encoder: the paper's baseline (appendix A.4, figure 2 box A).
 
-    o_attn = softmax(q(o) k(o)^T / sqrt(d)) v(o)
+    o_attn = softmax(q(o) k(o)^T / sqrt(D)) v(o)
     z = LayerNorm(f_phi(sum_{i=1..K+1} o_attn_i))
 
 The goal joins the K objects as token K+1, and every token attends to every token: (K+1)^2 weights
 per head. As in the paper's equations there is no output projection and no residual.
 
 Shapes: objects (B, K, D), goal (B, D), present (B, K) bool -> z (B, Z).
-        B batch, K objects, D token width (the paper's d), Z width of z (its d_z),
-        H heads, d = D / H width of a head.
+        B batch, K objects, D token width (the paper's d), Z width of z (its d_z), H heads.
+        The softmax divides by the square root of a head's width D / H, as is usual; the paper's
+        equation, for one head, by that of D.
 Run:    python attn.py
 """
 import math
@@ -62,7 +63,7 @@ class ATTN(nn.Module):
         self.norm = nn.LayerNorm(Z)
 
     def split_heads(self, x):
-        """(B, K+1, D) -> (B, H, K+1, d)."""
+        """(B, K+1, D) -> (B, H, K+1, D/H)."""
         B, count, D = x.shape
         return x.view(B, count, self.heads, D // self.heads).transpose(1, 2)
 
@@ -73,18 +74,18 @@ class ATTN(nn.Module):
         """
         check_shapes(self.token_dim, objects, goal, present)
         tokens = torch.cat([objects, goal[:, None]], dim=1)    # (B, K+1, D)
-        q = self.split_heads(self.q(tokens))                   # (B, H, K+1, d)
-        k = self.split_heads(self.k(tokens))                   # (B, H, K+1, d)
-        v = self.split_heads(self.v(tokens))                   # (B, H, K+1, d)
+        q = self.split_heads(self.q(tokens))                   # (B, H, K+1, D/H)
+        k = self.split_heads(self.k(tokens))                   # (B, H, K+1, D/H)
+        v = self.split_heads(self.v(tokens))                   # (B, H, K+1, D/H)
 
-        # softmax(q k^T / sqrt(d)) v
+        # softmax(q k^T / sqrt(D/H)) v
         score = q @ k.transpose(2, 3) / math.sqrt(q.shape[-1])             # (B, H, K+1, K+1)
         if present is not None:
             goal_is_real = present.new_ones(len(present), 1)   # (B, 1) bool
             real = torch.cat([present, goal_is_real], dim=1)   # (B, K+1)
             score = score.masked_fill(~real[:, None, None], -math.inf)
         weights = score.softmax(dim=-1)                        # (B, H, K+1, K+1)
-        per_head = weights @ v                                 # (B, H, K+1, d)
+        per_head = weights @ v                                 # (B, H, K+1, D/H)
         attended = per_head.transpose(1, 2).reshape(tokens.shape)          # (B, K+1, D), joined
         return attended, weights
 

@@ -71,9 +71,9 @@ class LRN(nn.Module):
         if not self.with_goal:
             return self.g(self.first(objects))                 # (B, K, D), r_i = g_theta(o_i)
 
-        # Linear in K because every o_i meets the goal alone. A constant factor is saved beside it:
-        # the first layer on a pair is W [o_i; o_goal] + b = W_o o_i + (W_goal o_goal + b), and the
-        # bracket, the same for every i, is computed once.
+        # The cost is linear in K because each o_i is paired with the goal only. The first layer is
+        # cheaper still: W [o_i; o_goal] + b = W_o o_i + (W_goal o_goal + b), and the bracket, the
+        # same for every i, is computed once.
         W_o, W_goal = self.first.weight.split(self.token_dim, dim=1)       # (D, D) each
         from_objects = linear(objects, W_o)                    # (B, K, D)
         from_goal = linear(goal, W_goal, self.first.bias)      # (B, D)

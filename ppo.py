@@ -6,10 +6,11 @@
         + c_a auxiliary loss                                       c_a `auxiliary`
 
 For dict observations and continuous actions. All it asks of a network is
-`agent(obs) -> (mean (B, A), log_std (A,), value (B,))`; of an environment, Gymnasium's reset and
-step. A rank is one of the processes that train together: each steps its own environments, and they
-average gradients and the moments of advantages and returns over torch.distributed (as DD-PPO
-does), so n ranks give the gradient of one rank on the joined minibatch.
+`agent(obs) -> (mean (B, A), log_std (A,), value (B,))`, where log_std is a parameter, the same for
+every observation; of an environment, Gymnasium's reset and step. A rank is one of the processes
+that train together: each steps its own environments, and they average gradients and the moments of
+advantages and returns over torch.distributed (as DD-PPO does), so n ranks give the gradient of one
+rank on the joined minibatch.
 
 Shapes: T steps of a rollout, E environments of this rank, B = T * E samples, A actions.
         What a rollout stores is (T, E, ...).
@@ -27,9 +28,10 @@ def gae(rewards, values, next_values, terminated, done, discount, lam):
     """Generalised advantage estimation (Schulman et al., 2016): inputs (T, E) -> advantages (T, E).
 
     next_values[t] is the value of the observation that step t led to. At the end of an episode
-    that is its final observation, not the first one of the next episode. A termination has no
-    future, so delta drops its value; a truncation has one, so delta keeps it. The recursion is cut
-    wherever an episode ends, for either reason, or the rollout does (`done`).
+    that is its final observation, not the first one of the next episode. After a termination there
+    is no future, so delta leaves next_values out; after a truncation there is one, so it keeps
+    them. `done` marks the end of an episode, for either reason, or of the rollout: from there
+    A_{t+1} is not carried back.
     """
     advantages = torch.zeros_like(rewards)
     following = torch.zeros_like(rewards[0])                   # A_{t+1}, (E,)
@@ -59,14 +61,14 @@ def rank_mean(tensor):
 def as_one_vector(agent):
     """Move all weights of `agent` into one vector, and their gradients into its `.grad`.
 
-    The agent's parameters become views of it. Averaging over ranks, clipping and Adam are then a
-    few operations in all instead of a few per layer, which on small networks costs as much as the
-    matrix products. Keep the views: never set a gradient to None, never call agent.to() afterwards.
+    The agent's parameters become views of it. Averaging over ranks, clipping and Adam then take a
+    few operations in all; done layer by layer, they would cost as much as the matrix products on
+    networks this small. Keep the views: never set a gradient to None, never call agent.to().
     """
     parameters = list(agent.parameters())
     weights = nn.utils.parameters_to_vector(parameters).detach()
     weights.grad = torch.zeros_like(weights)
-    nn.utils.vector_to_parameters(weights, parameters)
+    nn.utils.vector_to_parameters(weights, parameters)         # shared memory, not a copy
     sizes = [p.numel() for p in parameters]
     for p, gradient in zip(parameters, weights.grad.split(sizes)):
         p.grad = gradient.view_as(p)
@@ -249,8 +251,8 @@ class PPO(nn.Module):
     def normalized_batch(self):
         """The last rollout as (B, ...) tensors with normalised returns and advantages.
 
-        Also moves the running moments on: this rollout's values were read with the old ones, and
-        the value network learns in units of the new ones; the two differ little.
+        Also updates the running moments. rollout() scaled the values with the old moments; the
+        targets here are normalised with the new ones. An update changes them little.
         """
         batch = {key: value.flatten(0, 1) for key, value in self.batch.items()}
         returns, advantages = batch["returns"], batch["advantages"]
