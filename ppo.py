@@ -6,11 +6,11 @@
         + c_a auxiliary loss                                       c_a `auxiliary`
 
 For dict observations and continuous actions. All it asks of a network is
-`agent(obs) -> (mean (B, A), log_std (A,), value (B,))`, where log_std is a parameter, the same for
-every observation; of an environment, Gymnasium's reset and step. A rank is one of the processes
-that train together: each steps its own environments, and they average gradients and the moments of
-advantages and returns over torch.distributed (as DD-PPO does), so n ranks give the gradient of one
-rank on the joined minibatch.
+`agent(obs) -> (mean (n, A), log_std (A,), value (n,))` for any number n of observations, where
+log_std is a parameter, the same for all; of an environment, Gymnasium's reset and step.
+A rank is one of the processes that train together: each steps its own environments, and they
+average gradients and the moments of advantages and returns over torch.distributed (as DD-PPO
+does), so many ranks give the gradient of one on the joined minibatch.
 
 Shapes: T steps of a rollout, E environments of this rank, B = T * E samples, A actions.
         What a rollout stores is (T, E, ...).
@@ -44,9 +44,9 @@ def gae(rewards, values, next_values, terminated, done, discount, lam):
 
 
 def normal_log_prob(actions, mean, log_std):
-    """Log density (B,) of actions (B, A) under a Gaussian with independent components."""
+    """Log density (n,) of actions (n, A) under a Gaussian with independent components."""
     scaled = (actions - mean) * torch.exp(-log_std)
-    log_density = -0.5 * scaled ** 2 - log_std - 0.5 * math.log(2 * math.pi)           # (B, A)
+    log_density = -0.5 * scaled ** 2 - log_std - 0.5 * math.log(2 * math.pi)           # (n, A)
     return log_density.sum(-1)
 
 
@@ -184,7 +184,7 @@ class PPO(nn.Module):
             for key, array in self.arrays.items():
                 array[t] = [observation[key] for observation in current]
             mean, log_std, value = self.agent({key: x[t] for key, x in self.observations.items()})
-            if noise is None:                                  # all at once: one call, not T
+            if noise is None:                                  # at t = 0, for all T steps at once
                 noise = torch.randn(T, *mean.shape) * log_std.exp()        # (T, E, A)
             means.append(mean)
             values.append(value)
@@ -212,7 +212,9 @@ class PPO(nn.Module):
 
     def values_of_what_follows(self, values, final_observations):
         """V(s_{t+1}) (T, E): the next row of `values`, or the value of a final observation."""
-        next_values = values.roll(-1, dims=0)                  # the last row is always replaced
+        # Row t+1 moves to row t. That is wrong where an episode ended and in the last row; play()
+        # kept a final observation for each of those, and its value goes there.
+        next_values = values.roll(-1, dims=0)
         observations = final_observations.values()
         last = {key: torch.from_numpy(np.stack([observation[key] for observation in observations]))
                 for key in self.observations}
