@@ -238,11 +238,11 @@ def play_chunk(arguments):
 
 
 def save_rows(path, rows):
-    """Write rows into a zeroshot.csv; rows of other N stay. ValueError if it is another file."""
+    """Write rows into a zeroshot.csv that check_csv() has let pass; rows of other N stay."""
     lines = {}
     if os.path.exists(path):
         with open(path, newline="") as file:
-            header, *old = csv.reader(file)
+            _, *old = csv.reader(file)
         lines = {int(line[0]): line for line in old}
     for row in rows:
         lines[row["distractors"]] = [
