@@ -7,12 +7,14 @@ Run:    pytest -q                                        under 3 minutes on 2 co
 """
 import ast
 import csv
+import itertools
 import math
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from types import SimpleNamespace
 from xml.etree import ElementTree
@@ -337,14 +339,28 @@ def pose(env, cube):
     return pb.getBasePositionAndOrientation(env._cubes[cube], **env._world)
 
 
+def joints(env):
+    """Angle, velocity, forces and torque of the nine joints, from PyBullet."""
+    return [state for finger in env._fingers
+            for state in pb.getJointStates(finger, range(3), **env._world)]
+
+
 def angles(env):
     """Joint angles (9,), from PyBullet."""
-    return np.array([state[0] for state in pb.getJointStates(env._robot, range(9), **env._world)])
+    return np.array([state[0] for state in joints(env)])
 
 
 def set_joints(env, q):
     for j in range(9):
-        pb.resetJointState(env._robot, j, q[j], 0.0, **env._world)
+        pb.resetJointState(env._fingers[j // 3], j % 3, q[j], 0.0, **env._world)
+
+
+def drive(env, bodies, targets):
+    """Ask the joints of some bodies, taken in order, for angles."""
+    each = len(targets) // len(bodies)
+    for body, part in zip(bodies, np.reshape(targets, (len(bodies), each)).tolist()):
+        pb.setJointMotorControlArray(body, range(each), pb.POSITION_CONTROL, targetPositions=part,
+                                     forces=[0.36] * each, **env._world)
 
 
 def let_run(env, steps):
@@ -354,7 +370,7 @@ def let_run(env, steps):
 
 def fingertip(env, k):
     """Tip of finger k from PyBullet's forward kinematics."""
-    state = pb.getLinkState(env._robot, 3 * k + 2, computeForwardKinematics=1, **env._world)
+    state = pb.getLinkState(env._fingers[k], 2, computeForwardKinematics=1, **env._world)
     return np.array(pb.multiplyTransforms(state[4], state[5], [0, -0.008, -0.16], STILL)[0])
 
 
@@ -391,20 +407,31 @@ def test_inverse_kinematics_undoes_the_forward_ones():
             tri.inverse_kinematics(0, far)
 
 
-def test_masses_limits_and_friction_are_those_of_trifinger_edu(env):
-    """Numbers of TriFingerEdu's URDF and of CausalWorld, as PyBullet has taken them up."""
+def test_masses_and_limits_are_those_of_trifinger_edu(env):
+    """Numbers of TriFingerEdu's URDF, as PyBullet has taken them up."""
     masses, inertias = (0.14854, 0.14854, 0.0407), (4.1e-4, 4.1e-4, 1.6e-4)
-    for j in range(9):
-        mass, friction, inertia, *_ = pb.getDynamicsInfo(env._robot, j, **env._world)
-        assert mass == pytest.approx(masses[j % 3]) and friction == 0.1
-        assert max(inertia) == pytest.approx(inertias[j % 3])
-        info = pb.getJointInfo(env._robot, j, **env._world)
+    limits = ((-1.57, 1.0), (-1.2, 1.57), (-3.0, 3.0))
+    for finger, j in itertools.product(env._fingers, range(3)):
+        mass, _, inertia, *_ = pb.getDynamicsInfo(finger, j, **env._world)
+        assert mass == pytest.approx(masses[j])
+        assert max(inertia) == pytest.approx(inertias[j])
+        info = pb.getJointInfo(finger, j, **env._world)
         damping, lower, upper, effort = info[6], *info[8:11]
-        assert (lower, upper) == ((-1.57, 1.0), (-1.2, 1.57), (-3.0, 3.0))[j % 3]
+        assert (lower, upper) == limits[j]
         assert effort == pytest.approx(0.36) and damping == 0
+    assert len(env._fingers) == 3
+
+
+@pytest.mark.parametrize("options, mass, friction", [
+    ({}, 0.08, 1.0), ({"cube_mass": 0.02, "finger_friction": 0.1}, 0.02, 0.1)])
+def test_mass_and_friction_are_those_asked_for(options, mass, friction):
+    env = TriFingerEnv(distractors=1, **options)
+    env.reset(seed=0)
     for cube in env._cubes:
-        mass, friction, *_ = pb.getDynamicsInfo(cube, -1, **env._world)
-        assert mass == pytest.approx(0.08) and friction == 1.0
+        assert pb.getDynamicsInfo(cube, -1, **env._world)[:2] == (mass, 1.0)
+    for finger, j in itertools.product(env._fingers, range(3)):
+        assert pb.getDynamicsInfo(finger, j, **env._world)[1] == friction
+    env.close()
 
 
 @pytest.mark.parametrize("substeps, dt", [(5, 0.008), (3, 0.004)])
@@ -448,7 +475,7 @@ def test_the_wall_is_closed_and_stands_at_its_radius(env):
         for cube in range(3):
             put(env, cube, (0, 0, 1 + cube))
         for body, _, share, *_ in pb.rayTestBatch([start] * 360, start + outside, **env._world):
-            assert body not in (-1, env._robot)
+            assert body not in (-1, *env._fingers)
             assert 0.242 - 1e-3 < 0.4 * share < 0.242 / math.cos(math.pi / 12) + 1e-3
     down = pb.rayTest([0.02, 0.03, 0.5], [0.02, 0.03, -0.5], **env._world)[0]
     assert down[3][2] == pytest.approx(0.0, abs=1e-6)
@@ -460,9 +487,67 @@ def test_fingers_push_with_at_most_their_torque(env):
     largest = 0.0
     for t in range(20):
         env.step(np.full(9, (-1.0) ** (t // 2)))
-        states = pb.getJointStates(env._robot, range(9), **env._world)
-        largest = max(largest, *(abs(state[3]) for state in states))
+        largest = max(largest, *(abs(state[3]) for state in joints(env)))
     assert largest == pytest.approx(0.36, rel=1e-3)
+
+
+def as_one_body(env):
+    """Take the three fingers out of the world and load one robot of nine joints in their place."""
+    robot = ElementTree.Element("robot", name="trifinger")
+    ElementTree.SubElement(robot, "link", name="base")
+    for k, ((x, y, z), yaw) in enumerate(zip(tri.FINGER_MOUNT, tri.FINGER_YAW)):
+        finger = ElementTree.fromstring(tri.finger_urdf())
+        finger.remove(finger.find("link"))                     # its own base
+        mount = finger.find("joint").find("origin")
+        mount.set("xyz", f"{x} {y} {z}")
+        mount.set("rpy", f"0 0 {yaw}")
+        for part in finger.iter():
+            for key in ("name", "link"):
+                if part.get(key) in ("upper", "middle", "lower"):
+                    part.set(key, f"{part.get(key)}{k}")
+            if part.tag == "joint":
+                part.set("name", f"{part.get('name')} of finger {k}")
+        robot.extend(finger)
+    for finger in env._fingers:
+        pb.removeBody(finger, **env._world)
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "robot.urdf")
+        ElementTree.ElementTree(robot).write(path)
+        flags = pb.URDF_USE_INERTIA_FROM_FILE | pb.URDF_USE_SELF_COLLISION
+        body = pb.loadURDF(path, useFixedBase=1, flags=flags, **env._world)
+    assert pb.getNumJoints(body, **env._world) == 9
+    for j in range(9):
+        assert pb.getJointInfo(body, j, **env._world)[12].decode().endswith(str(j // 3))
+        pb.changeDynamics(body, j, lateralFriction=1.0, linearDamping=0, angularDamping=0,
+                          jointDamping=0, **env._world)
+        pb.resetJointState(body, j, tri.REST[j % 3], 0.0, **env._world)
+    return body
+
+
+@pytest.mark.parametrize("iterations, tolerance", [(500, 1e-12), (8, 1e-2)])
+def test_three_fingers_move_as_one_robot_of_nine_joints_does(iterations, tolerance):
+    """The base is fixed, so the dynamics are the same: equal to rounding once the solver has run
+    until nothing changes, and within 10 mrad after our 8 iterations."""
+    three, one = (TriFingerEnv(distractors=0) for _ in range(2))
+    for env in (three, one):
+        env.reset(seed=0)
+        put(env, 0, (0.18, 0.0, tri.CUBE / 2))                 # out of the way
+        pb.setPhysicsEngineParameter(numSolverIterations=iterations, solverResidualThreshold=0,
+                                     **env._world)
+    robot = as_one_body(one)
+    rng = np.random.default_rng(0)
+    target = np.array(tri.REST * 3)
+    for _ in range(20):
+        target = target + rng.uniform(-0.1, 0.1, 9)
+        drive(three, three._fingers, target)
+        drive(one, [robot], target)
+        for env in (three, one):
+            let_run(env, 5)
+        states = pb.getJointStates(robot, range(9), **one._world)
+        np.testing.assert_allclose(angles(three), [state[0] for state in states], atol=tolerance)
+    assert np.abs(angles(three) - tri.REST * 3).max() > 0.2    # the fingers have moved
+    three.close()
+    one.close()
 
 
 def test_cubes_rest_without_jitter():
@@ -487,8 +572,8 @@ def test_fingers_at_full_speed_do_not_pass_through_cubes():
             if t % 25 == 0:
                 bang = np.sign(rng.uniform(-1, 1, 9))
             env.step(bang)
-            touched += any(pb.getContactPoints(env._robot, cube, **env._world)
-                           for cube in env._cubes)
+            touched += any(pb.getContactPoints(finger, cube, **env._world)
+                           for finger in env._fingers for cube in env._cubes)
             for position, quaternion in env._poses:
                 local = np.subtract(env._moment.tips, position) @ tri.rotation(quaternion)
                 inside = tri.CUBE / 2 - np.abs(local).max(axis=1)
@@ -505,12 +590,11 @@ def pushed(timestep):
     put(env, 1, (0.1, 0.15, tri.CUBE / 2))
     put(env, 2, (0.1, -0.15, tri.CUBE / 2))
     start, heading = np.array([-0.065, 0.01, 0.035]), np.array([0.1, 0.0, 0.0])
-    joints = [*tri.inverse_kinematics(0, start), *(0.0, 1.4, -1.0) * 2]        # others lifted
-    set_joints(env, joints)
+    lifted = (0.0, 1.4, -1.0) * 2                              # the other two fingers
+    set_joints(env, [*tri.inverse_kinematics(0, start), *lifted])
     for step in range(round(1 / timestep)):
-        joints[:3] = tri.inverse_kinematics(0, start + step * timestep * heading)
-        pb.setJointMotorControlArray(env._robot, range(9), pb.POSITION_CONTROL,
-                                     targetPositions=joints, forces=[0.36] * 9, **env._world)
+        pushing = tri.inverse_kinematics(0, start + step * timestep * heading)
+        drive(env, env._fingers, [*pushing, *lifted])
         let_run(env, 1)
     end = np.array(pose(env, 0)[0])
     env.close()
@@ -521,6 +605,40 @@ def test_a_slow_push_carries_a_cube_as_far_in_long_steps_as_in_short_ones():
     long_steps, short_steps = pushed(0.008), pushed(0.002)
     assert short_steps[0] > 0.04
     assert np.linalg.norm(long_steps - short_steps) < 0.015
+
+
+def reach_for(env, points, actions=25):
+    """Let the commanded fingertips go to three points (3, 3) in as many actions."""
+    wanted = [q for k in range(3) for q in tri.inverse_kinematics(k, points[k])]
+    for left in range(actions, 0, -1):
+        env.step(np.subtract(wanted, env._targets) / left / env.action_scale)
+
+
+def grasp_and_raise(task, depth=0.02, **physics):
+    """Heights of the cube while it is held for two seconds by zero actions, after three fingertips
+    have closed round it, pressed `depth` (m) inwards and risen to 0.15 m."""
+    env = TriFingerEnv(task, 0, episode_steps=1000, **physics)
+    env.reset(seed=0)
+    put(env, 0, (0, 0, tri.CUBE / 2))
+    sides = np.array([[x, y, 0] for x, y, _ in tri.FINGER_MOUNT]) / 0.0455     # unit vectors
+    pressed = tri.CUBE / 2 - depth
+    for radius, height in ((0.08, 0.03), (pressed, 0.03), (pressed, 0.15)):
+        reach_for(env, radius * sides + [0, 0, height])
+    heights = []
+    for _ in range(50):
+        env.step(np.zeros(9))
+        heights.append(pose(env, 0)[0][2])
+    env.close()
+    return np.array(heights)
+
+
+@pytest.mark.parametrize("task", ["push", "lift"])
+def test_a_cube_can_be_lifted_and_held(task):
+    """By inverse kinematics, nothing is learnt. With CausalWorld's friction nothing holds."""
+    heights = grasp_and_raise(task)
+    assert heights.min() > 0.14, heights.min()
+    heights = grasp_and_raise(task, finger_friction=0.1)
+    assert heights.max() < 0.05, heights.max()
 
 
 # ---------------------------------------------------------------- the robot's picture
@@ -565,35 +683,31 @@ def hangs_together(link):
 
 
 def test_the_robots_drawn_parts_are_joined_from_the_mount_to_the_tip():
-    robot = ElementTree.fromstring(tri.robot_urdf())
+    robot = ElementTree.fromstring(tri.finger_urdf())
     links = {link.get("name"): link for link in robot.findall("link")}
-    joints = robot.findall("joint")
-    assert len(joints) == 9
-    for joint in joints:
+    assert len(robot.findall("joint")) == 3
+    for joint in robot.findall("joint"):
         place = np.array(joint.find("origin").get("xyz").split(), float)
         parent, child = (links[joint.find(end).get("link")] for end in ("parent", "child"))
         assert gap(place, parent) < 0.003, joint.get("name")
         assert gap(np.zeros(3), child) < 0.003, joint.get("name")
     assert all(map(hangs_together, links.values()))
-    for k in range(3):
-        assert gap(np.array([0, -0.008, -0.16]), links[f"lower{k}"]) == 0      # the tip
+    assert gap(np.array([0, -0.008, -0.16]), links["lower"]) == 0          # the tip
     away = np.array([0.05, 0.05, 0.0])
-    assert gap(away, links["lower0"]) > 0.03                   # and the measure can tell
+    assert gap(away, links["lower"]) > 0.03                    # and the measure can tell
+    for x, y, _ in tri.FINGER_MOUNT:                           # bars meet in the robot's centre
+        assert gap(np.array([math.hypot(x, y), 0, 0]), links["base"]) == 0
 
 
 def test_the_robots_file_has_short_lines():
     """Bullet reads a URDF in pieces of at most 8191 characters of a line and cuts names apart."""
-    assert max(map(len, tri.robot_urdf().splitlines())) < 8192
+    assert max(map(len, tri.finger_urdf().splitlines())) < 8192
 
 
 def test_only_lower_links_can_touch_things(env):
-    robot = ElementTree.fromstring(tri.robot_urdf())
-    touching = [link.get("name") for link in robot.findall("link")
-                if link.find("collision") is not None]
-    assert touching == ["lower0", "lower1", "lower2"]
-    for j in range(-1, 9):
-        shapes = pb.getCollisionShapeData(env._robot, j, **env._world)
-        assert len(shapes) == (j >= 0 and j % 3 == 2)
+    for finger, j in itertools.product(env._fingers, range(-1, 3)):
+        shapes = pb.getCollisionShapeData(finger, j, **env._world)
+        assert len(shapes) == (j == 2)
         for shape in shapes:
             length, radius = shape[3][:2]
             assert (length, radius) == pytest.approx((0.16, 0.0095))
@@ -869,11 +983,15 @@ def test_observation_is_table_1(env):
         identifier = env._ids[cube]
         expected = [1, *size, *position, *quaternion, *linear, *angular, identifier]
         np.testing.assert_allclose(row, expected, atol=1e-5)
-    states = pb.getJointStates(env._robot, range(9), **env._world)
-    for k, row in enumerate(obs["fingers"] * tri.FINGER_SCALE):
+    rows = obs["fingers"] * tri.FINGER_SCALE
+    states = joints(env)
+    for k, row in enumerate(rows):
         q = [state[0] for state in states[3 * k:3 * k + 3]]
         dq = [state[1] for state in states[3 * k:3 * k + 3]]
-        np.testing.assert_allclose(row, [*q, *dq, k - 1, *fingertip(env, k)], atol=1e-5)
+        np.testing.assert_allclose(row[:7], [*q, *dq, k - 1], atol=1e-5)
+    set_joints(env, env._targets)
+    for k, row in enumerate(rows):                             # where the finger is told to be
+        np.testing.assert_allclose(row[7:], fingertip(env, k), atol=1e-5)
     position, quaternion = env.goal
     expected = [1, *size, *position, *quaternion, env._ids[env.target]]
     np.testing.assert_allclose(obs["goal"] * tri.GOAL_SCALE, expected, atol=1e-5)
@@ -888,8 +1006,9 @@ def test_observation_is_scaled_by_fixed_numbers(env):
     np.testing.assert_allclose(row[4:7], np.array(position) / 0.2, atol=1e-5)
     np.testing.assert_allclose(row[11:14], np.array(linear) / 0.5, atol=1e-5)
     np.testing.assert_allclose(row[14:17], np.array(angular) / 10, atol=1e-5)
-    q, dq, *_ = pb.getJointState(env._robot, 4, **env._world)
+    q, dq, *_ = joints(env)[4]
     finger = obs["fingers"][1]
+    set_joints(env, env._targets)
     expected = [q / 1.5, dq / 10, 0, fingertip(env, 1)[2] / 0.2]
     np.testing.assert_allclose(finger[[1, 4, 6, 9]], expected, atol=1e-5)
     goal = obs["goal"]
@@ -909,27 +1028,52 @@ def test_names_of_columns_are_those_of_table_1():
     assert finger[tri.FINGER_IDENTIFIER] == 6 and finger[tri.FINGERTIP].tolist() == [7, 8, 9]
 
 
-def test_actions_ask_for_the_angles_they_should(monkeypatch):
-    """What reaches PyBullet's motors: delta adds 0.3 rad to the measured angles, absolute spans
-    the joint range, both end at the limits."""
+@pytest.mark.parametrize("mode, options, scale", [
+    ("integrated", {}, 0.1), ("integrated", {"action_scale": 0.06}, 0.06),
+    ("delta", {"action_scale": 0.3}, 0.3), ("absolute", {}, None)])
+def test_actions_ask_for_the_angles_they_should(monkeypatch, mode, options, scale):
+    """What reaches PyBullet's motors: integrated adds to the last targets, at most 0.25 rad off
+    the measured angles; delta adds to these; absolute spans the joint range."""
     asked = []
     monkeypatch.setattr(pb, "setJointMotorControlArray",
-                        lambda *_, targetPositions, **__: asked.append(targetPositions))
+                        lambda *_, targetPositions, **__: asked.extend(targetPositions))
     low, high = np.array(tri.LOWER * 3), np.array(tri.UPPER * 3)
-    for mode in ("delta", "absolute"):
-        env = TriFingerEnv(distractors=0, action_mode=mode)
-        env.reset(seed=0)
-        for action in (np.zeros(9), np.ones(9), -np.ones(9), np.linspace(-1, 1, 9)):
+    env = TriFingerEnv(distractors=0, action_mode=mode, **options)
+    slope = np.linspace(-1, 1, 9)
+    for episode in range(2):                                   # the second one starts afresh, too
+        env.reset(seed=episode or None)
+        target = np.array((0.0, 0.55, -0.7) * 3)
+        for action in (np.zeros(9), np.ones(9), -np.ones(9), slope, slope, slope, slope, 0 * slope):
             q = angles(env)
+            asked.clear()
             env.step(action)
-            expected = q + 0.3 * action
-            if mode == "absolute":
-                expected = (low + high) / 2 + action * (high - low) / 2
-            np.testing.assert_allclose(asked[-1], expected, atol=1e-9)
-        set_joints(env, (0.9, -1.1, 2.9) * 3)
-        env._read()
-        env.step(np.array([1, -1, 1] * 3))
-        np.testing.assert_allclose(asked[-1], (1.0, -1.2, 3.0) * 3, atol=1e-9)
+            if mode == "integrated":
+                target = np.clip(target + scale * action, q - 0.25, q + 0.25)
+            elif mode == "delta":
+                target = q + scale * action
+            else:
+                target = (low + high) / 2 + action * (high - low) / 2
+            np.testing.assert_allclose(asked, target, atol=1e-9)
+    set_joints(env, (0.9, -1.1, 2.9) * 3)
+    env._read()
+    asked.clear()
+    env._targets = list((0.95, -1.15, 2.95) * 3)
+    env.step(np.array([1, -1, 1] * 3))
+    np.testing.assert_allclose(asked, (1.0, -1.2, 3.0) * 3, atol=1e-9)     # the joints' limits
+    env.close()
+
+
+def test_fingertips_are_seen_where_they_are_told_to_be_if_targets_stay():
+    """Targets that stay are a state: integrated mode shows them, the others what is measured."""
+    for mode in ("integrated", "delta", "absolute"):
+        env = TriFingerEnv(distractors=0, action_mode=mode)
+        obs, _ = env.reset(seed=0)
+        for _ in range(4):
+            obs, *_ = env.step(np.linspace(-1, 1, 9))
+        shown = obs["fingers"][:, 7:] * 0.2
+        measured = [fingertip(env, k) for k in range(3)]
+        is_measured = np.abs(shown - measured).max() < 1e-5
+        assert is_measured == (mode != "integrated")
         env.close()
 
 
@@ -1046,7 +1190,7 @@ def test_diverged_physics_end_the_episode_and_the_next_one_is_sound(kind):
     elif kind == "angular velocity":
         put(env, 1, (0, 0, 0.1), spin=nans)
     else:
-        pb.resetJointState(env._robot, 4, 0.0, float("nan"), **env._world)
+        pb.resetJointState(env._fingers[1], 1, 0.0, float("nan"), **env._world)
     obs, reward, terminated, truncated, info = env.step(np.zeros(9))
     assert info["truncated_by"] == "the physics diverged" and truncated and not terminated
     assert reward == 0 and not any(info["rewards"].values())
@@ -1112,6 +1256,9 @@ def test_soak(n, task, kind):
     ({"substeps": 0}, "positive"),
     ({"timestep": 0.0}, "positive"),
     ({"action_mode": "torque"}, "action_mode"),
+    ({"action_scale": 0.0}, "positive"),
+    ({"cube_mass": -0.08}, "positive"),
+    ({"finger_friction": float("nan")}, "positive"),
     ({"render_mode": "ascii"}, "render_mode"),
 ])
 def test_bad_arguments_are_refused(arguments, words):
@@ -1897,7 +2044,7 @@ def test_every_setting_reaches_the_learner_and_its_environments():
               "lam": 0.5, "value_coef": 0.7, "max_grad_norm": 0.8, "anneal_lr": False,
               "anneal_clip": True, "normalize_advantages": False, "normalize_values": False}
     of_env = {"episode_steps": 11, "substeps": 2, "timestep": 0.002, "action_mode": "absolute",
-              "goal_yaw": 0.12}
+              "action_scale": 0.07, "cube_mass": 0.03, "finger_friction": 0.6, "goal_yaw": 0.12}
     others = {"envs": 6, "adam_eps": 0.2, "entropy": 0.6, "auxiliary": 0.9, "reward_overlap": 1.0,
               "reward_distance": 2.0, "reward_curiosity": 3.0, "reward_reach": 4.0}
     settings = {**train.DEFAULTS, **of_ppo, **of_env, **others}
@@ -1918,8 +2065,7 @@ def test_every_setting_reaches_the_learner_and_its_environments():
 def test_the_environment_alone_is_the_one_of_a_run_with_default_settings():
     alone = TriFingerEnv()
     of_a_run = train.make_env("push", 2, train.DEFAULTS)
-    for name in ("task", "distractors", "episode_steps", "substeps", "timestep", "action_mode",
-                 "goal_yaw", "reward_weights"):
+    for name in ("task", "distractors", "reward_weights", *train.ENV_SETTINGS):
         assert getattr(alone, name) == getattr(of_a_run, name), name
     alone.close()
     of_a_run.close()
@@ -3156,16 +3302,21 @@ MUTATIONS = {
     ),
     "trifinger_env.py": (
         # The world
-        ("\"cube\": 1.0", "\"cube\": 0.7", "test_friction_of_a_cube_on_the_floor"),
-        ("\"floor\": 0.5", "\"floor\": 0.6", "test_friction_of_a_cube_on_the_floor"),
-        ("\"finger\": 0.1", "\"finger\": 0.5",
-         "test_masses_limits_and_friction_are_those_of_trifinger_edu"),
-        ("CUBE_MASS = 0.08 ", "CUBE_MASS = 0.02 ",
-         "test_masses_limits_and_friction_are_those_of_trifinger_edu"),
-        ("pb.URDF_USE_INERTIA_FROM_FILE | pb.", "pb.",
-         "test_masses_limits_and_friction_are_those_of_trifinger_edu"),
+        ("CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5", "CUBE_FRICTION, FLOOR_FRICTION = 0.7, 0.5",
+         "test_friction_of_a_cube_on_the_floor"),
+        ("CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5", "CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.6",
+         "test_friction_of_a_cube_on_the_floor"),
+        ("lateralFriction=self.finger_friction", "lateralFriction=1.0",
+         "test_mass_and_friction_are_those_asked_for"),
+        ("finger_friction=1.0", "finger_friction=0.5",
+         "test_mass_and_friction_are_those_asked_for"),
+        ("self._body(self.cube_mass, half", "self._body(0.08, half",
+         "test_mass_and_friction_are_those_asked_for"),
+        ("cube_mass=0.08", "cube_mass=0.02", "test_mass_and_friction_are_those_asked_for"),
+        ("flags = pb.URDF_USE_INERTIA_FROM_FILE", "flags = 0",
+         "test_masses_and_limits_are_those_of_trifinger_edu"),
         ("UPPER = (1.0, 1.57, 3.0)", "UPPER = (1.0, 1.57, 2.7)",
-         "test_masses_limits_and_friction_are_those_of_trifinger_edu"),
+         "test_masses_and_limits_are_those_of_trifinger_edu"),
         ("setGravity(0, 0, -9.81", "setGravity(0, 0, -9.0",
          "test_a_cube_falls_by_gravity_for_the_time_of_a_step"),
         ("fixedTimeStep=self.timestep", "fixedTimeStep=0.008",
@@ -3183,6 +3334,10 @@ MUTATIONS = {
         ("90 + 120 * k", "90 + 110 * k", "test_kinematics_by_hand"),
         ("math.atan2(-x, -depth) - q2 / 2", "math.atan2(-x, -depth) - q2",
          "test_inverse_kinematics_undoes_the_forward_ones"),
+        ("jointDamping=0, **self._world", "jointDamping=0.01, **self._world",
+         "test_masses_and_limits_are_those_of_trifinger_edu"),
+        ("bar((BASE, 0, 0), (0, 0, 0), 0.018, METAL)", "bar((0, BASE, 0), (0, 0, 0), 0.018, METAL)",
+         "test_the_robots_drawn_parts_are_joined_from_the_mount_to_the_tip"),
         ("bar((0, 0, 0), knee, 0.013, METAL)", "bar((0, 0, -0.05), knee, 0.013, METAL)",
          "test_the_robots_drawn_parts_are_joined_from_the_mount_to_the_tip"),
         # Fractional success
@@ -3228,7 +3383,10 @@ MUTATIONS = {
          "test_the_goal_names_the_target_and_no_other_cube"),
         ("np.linspace(-1.0, 1.0, 21)", "np.arange(21.0)",
          "test_the_goal_names_the_target_and_no_other_cube"),
-        ("REST[j % 3], 0.0,", "REST[j % 3], 0.1,", "test_every_episode_starts_at_rest"),
+        ("REST[j], 0.0,", "REST[j], 0.1,", "test_every_episode_starts_at_rest"),
+        ("        self._targets = list(REST * 3)\n        self._steps = 0",
+         "        self._steps, self._targets = 0, getattr(self, \"_targets\", REST * 3)",
+         "test_actions_ask_for_the_angles_they_should"),
         ("if seed is not None or self._steps is None:", "if self._steps is None:",
          "test_same_seed_same_trajectory_bit_for_bit"),
         # Observation and action
@@ -3244,8 +3402,15 @@ MUTATIONS = {
         ("LINEAR, ANGULAR = slice(11, 14), slice(14, 17)",
          "ANGULAR, LINEAR = slice(11, 14), slice(14, 17)",
          "test_names_of_columns_are_those_of_table_1"),
-        ("DELTA = 0.3 ", "DELTA = 0.2 ", "test_actions_ask_for_the_angles_they_should"),
-        ("q + DELTA * a for", "DELTA * a for", "test_actions_ask_for_the_angles_they_should"),
+        ("fingertips(self._targets) if is_integrated", "self._moment.tips if is_integrated",
+         "test_fingertips_are_seen_where_they_are_told_to_be_if_targets_stay"),
+        ("is_integrated = self.action_mode == \"integrated\"", "is_integrated = True",
+         "test_fingertips_are_seen_where_they_are_told_to_be_if_targets_stay"),
+        ("LEAD = 0.25 ", "LEAD = 0.35 ", "test_actions_ask_for_the_angles_they_should"),
+        ("action_scale=0.1", "action_scale=0.2", "test_actions_ask_for_the_angles_they_should"),
+        ("zip(self._targets, action)", "zip(self._q, action)",
+         "test_actions_ask_for_the_angles_they_should"),
+        ("q + scale * a for", "scale * a for", "test_actions_ask_for_the_angles_they_should"),
         ("low + (high - low) * (a + 1) / 2", "low + (high - low) * a",
          "test_actions_ask_for_the_angles_they_should"),
         ("return clip(targets, LOWER * 3, UPPER * 3)", "return targets",
@@ -3350,7 +3515,7 @@ MUTATIONS = {
          "test_every_update_plays_other_episodes_and_is_told_how_much_is_left"),
         ("range(settings[\"envs\"] // ranks)", "range(settings[\"envs\"])",
          "test_every_setting_reaches_the_learner_and_its_environments"),
-        ("\"action_mode\", \"goal_yaw\")", "\"action_mode\")",
+        ("\"cube_mass\", \"finger_friction\", \"goal_yaw\")", "\"cube_mass\", \"goal_yaw\")",
          "test_every_setting_reaches_the_learner_and_its_environments"),
         ("\"anneal_lr\", \"anneal_clip\",\n", "\"anneal_lr\",\n",
          "test_every_setting_reaches_the_learner_and_its_environments"),

@@ -54,7 +54,10 @@ SETTINGS = {
     "episode_steps": Setting(125, 2500, "5 s, not 30 s: more episodes show more goals"),
     "substeps": Setting(5, 3, "25 Hz, not 83.3 Hz: exploration moves further per decision"),
     "timestep": Setting(0.008, 0.004, "s; a step costs the same, and 8 ms still behave (tested)"),
-    "action_mode": Setting("delta", "absolute", "steps explore better than absolute targets (CW)"),
+    "action_mode": Setting("integrated", "absolute", "targets that stay keep a grip; CW: absolute"),
+    "action_scale": Setting(0.1, 0.1, "rad, largest step of an action"),
+    "cube_mass": Setting(0.08, 0.02, "kg; CW's picking task"),
+    "finger_friction": Setting(1.0, 0.1, "IsaacGymEnvs; CW: 0.1, with which nothing is held"),
     "goal_yaw": Setting(0.0, math.pi / 4, "an axis-aligned goal asks for the position only"),
     "reward_overlap": Setting(100.0, 100.0, "alpha_1 (A.1)"),
     "reward_distance": Setting(5000.0, 250.0, "alpha_2 (A.1): as printed, 2 mm are worth 0.5"),
@@ -86,7 +89,8 @@ SETTINGS = {
     "log_std": Setting(-0.7, 0.0, "initial log standard deviation of the actions; rlpyt: 0"),
 }
 DEFAULTS = {name: setting.default for name, setting in SETTINGS.items()}
-ENV_SETTINGS = ("episode_steps", "substeps", "timestep", "action_mode", "goal_yaw")
+ENV_SETTINGS = ("episode_steps", "substeps", "timestep", "action_mode", "action_scale",
+                "cube_mass", "finger_friction", "goal_yaw")
 PPO_SETTINGS = ("steps", "epochs", "minibatches", "lr", "adam_eps", "clip", "discount", "lam",
                 "entropy", "value_coef", "max_grad_norm", "anneal_lr", "anneal_clip",
                 "normalize_advantages", "normalize_values", "auxiliary")

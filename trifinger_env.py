@@ -29,12 +29,15 @@ CUBE = 0.065                             # edge of a cube, m
 WALL = 0.242                             # inner radius of the arena, m
 WALL_SIDES = 12                          # the round wall is made of so many boxes
 REACH = 0.124                            # inside this radius a finger can get behind a cube, m
-CUBE_MASS = 0.08                         # kg
-FRICTION = {"cube": 1.0, "finger": 0.1, "floor": 0.5}          # Bullet multiplies the two
+CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multiplies the two in touch
+# A cube's mass and the fingers' friction are arguments, because sources differ. CausalWorld has
+# 0.08 kg (0.02 in its picking task) and 0.1, with which a cube can hardly be held
+# (results/grasp.py); trifinger_simulation 0.08 kg and 0.5; IsaacGymEnvs 0.08 kg and 1.0, as we do.
+# A real cube weighs 0.094 kg.
 IDENTIFIERS = np.linspace(-1.0, 1.0, 21)                       # pool: none is new when N grows
 
-# The robot: joints are upper, middle, lower of finger 0, then of 1, then of 2
-JOINTS = tuple(range(9))
+# The robot: three fingers of three joints each, upper, middle and lower
+JOINTS = (0, 1, 2)
 BASE = 0.0455                            # radius at which fingers are mounted, m
 HEIGHT = 0.34                            # height at which fingers are mounted, m
 LINK = 0.16                              # length of the middle and the lower link, m
@@ -44,12 +47,15 @@ LOWER = (-1.57, -1.2, -3.0)              # limits of upper, middle and lower joi
 UPPER = (1.0, 1.57, 3.0)
 REST = (0.0, 0.55, -0.7)                 # at reset, rad: tips hang beside the cubes, 0.045 m high
 TORQUE = 0.36                            # N m
-DELTA = 0.3                              # rad, largest step of action_mode="delta"
+LEAD = 0.25                              # rad, how far an integrated target may lead its joint
 FINGER_YAW = [-math.radians(90 + 120 * k) for k in range(3)]   # heading of finger k
+FINGER_MOUNT = [(-BASE * math.cos(yaw), -BASE * math.sin(yaw), HEIGHT) for yaw in FINGER_YAW]
 FINGER_SIN_COS = [(math.sin(yaw), math.cos(yaw)) for yaw in FINGER_YAW]
 
 # Table 1: columns of an observation's rows, for readers and for whoever picks some out. The
-# identifier comes last in cubes and goal.
+# identifier comes last in cubes and goal. In action_mode "integrated" a fingertip is shown where
+# the joint targets would hold it: targets are a state of their own then, and where the fingertip
+# really is follows from the joints' angles anyway.
 SIZE, POSITION, QUATERNION = slice(1, 4), slice(4, 7), slice(7, 11)        # of a cube and the goal
 LINEAR, ANGULAR = slice(11, 14), slice(14, 17)                             # of a cube
 IDENTIFIER = -1                                                            # of a cube and the goal
@@ -100,6 +106,11 @@ def inverse_kinematics(k, tip):
     q2 = -2 * math.acos(reach / (2 * LINK))
     q1 = math.atan2(-x, -depth) - q2 / 2
     return q0, q1, q2
+
+
+def fingertips(q):
+    """The three fingertips at joint angles q (9,), finger by finger."""
+    return [forward_kinematics(k, q[3 * k:3 * k + 3]) for k in range(3)]
 
 
 def clip(values, low, high):
@@ -276,33 +287,30 @@ def joint(parent, child, place, axis, lower, upper):
             f'<limit lower="{lower}" upper="{upper}" effort="{TORQUE}" velocity="100"/></joint>\n')
 
 
-def robot_urdf():
-    """URDF of the robot: masses and inertias of TriFingerEdu, a tip merged into its lower link.
+def finger_urdf():
+    """URDF of one finger: masses and inertias of TriFingerEdu, the tip merged into the lower link.
 
-    Only the lower links can touch things. What is drawn reaches from joint to joint. Lines are kept
+    Only the lower link can touch things. What is drawn reaches from joint to joint. Lines are kept
     short because PyBullet breaks a line after 1023 characters, wherever that is.
     """
-    knee, tip = (0, -0.03745, -0.16), (0, -0.008, -0.16)       # joints of the next link, its tip
+    knee, tip = (0, -0.03745, -0.16), (0, -0.008, -0.16)       # the lower joint, the fingertip
     touching = (f'<collision>{origin((0, -0.008, -0.08))}<geometry>'
                 f'<capsule radius="{TIP}" length="{LINK}"/></geometry></collision>')
-    mounts = [(-BASE * math.cos(yaw), -BASE * math.sin(yaw), HEIGHT) for yaw in FINGER_YAW]
-    hub = [bar((0, 0, HEIGHT), mount, 0.018, METAL) for mount in mounts]
-    parts = [link("base", 0, (0, 0, 0), (0, 0, 0), hub)]
-    for k, (yaw, mount) in enumerate(zip(FINGER_YAW, mounts)):
-        upper = [ball((0, 0, 0), 0.021, JOINT_COLOR), bar((0, 0, 0), (-0.10, 0, 0), 0.017, PLASTIC)]
-        middle = [ball((0, 0, 0), 0.019, JOINT_COLOR), bar((0, 0, 0), knee, 0.013, METAL)]
-        lower = [ball((0, 0, 0), 0.016, JOINT_COLOR), ball(tip, 0.011, JOINT_COLOR),
-                 bar((0, 0, 0), tip, TIP, PLASTIC)]
-        parts += [
-            link(f"upper{k}", 0.14854, (-0.079, 0, 0), (3e-5, 4.1e-4, 4.1e-4), upper),
-            link(f"middle{k}", 0.14854, (0, -0.019, -0.079), (4.1e-4, 4.1e-4, 3e-5), middle),
-            link(f"lower{k}", 0.0407, (0, -0.00875, -0.1065), (1.6e-4, 1.6e-4, 1e-5), lower,
-                 touching),
-            joint("base", f"upper{k}", origin(mount, (0, 0, yaw)), "-1 0 0", LOWER[0], UPPER[0]),
-            joint(f"upper{k}", f"middle{k}", origin((0, -0.014, 0)), "0 1 0", LOWER[1], UPPER[1]),
-            joint(f"middle{k}", f"lower{k}", origin(knee), "0 1 0", LOWER[2], UPPER[2]),
-        ]
-    return f'<robot name="trifinger">{"".join(parts)}</robot>'
+    hub = [bar((BASE, 0, 0), (0, 0, 0), 0.018, METAL)]         # from the robot's centre
+    upper = [ball((0, 0, 0), 0.021, JOINT_COLOR), bar((0, 0, 0), (-0.10, 0, 0), 0.017, PLASTIC)]
+    middle = [ball((0, 0, 0), 0.019, JOINT_COLOR), bar((0, 0, 0), knee, 0.013, METAL)]
+    lower = [ball((0, 0, 0), 0.016, JOINT_COLOR), ball(tip, 0.011, JOINT_COLOR),
+             bar((0, 0, 0), tip, TIP, PLASTIC)]
+    parts = [
+        link("base", 0, (0, 0, 0), (0, 0, 0), hub),
+        link("upper", 0.14854, (-0.079, 0, 0), (3e-5, 4.1e-4, 4.1e-4), upper),
+        link("middle", 0.14854, (0, -0.019, -0.079), (4.1e-4, 4.1e-4, 3e-5), middle),
+        link("lower", 0.0407, (0, -0.00875, -0.1065), (1.6e-4, 1.6e-4, 1e-5), lower, touching),
+        joint("base", "upper", origin((0, 0, 0)), "-1 0 0", LOWER[0], UPPER[0]),
+        joint("upper", "middle", origin((0, -0.014, 0)), "0 1 0", LOWER[1], UPPER[1]),
+        joint("middle", "lower", origin(knee), "0 1 0", LOWER[2], UPPER[2]),
+    ]
+    return f'<robot name="finger">{"".join(parts)}</robot>'
 
 
 # ---- the environment
@@ -324,8 +332,13 @@ class TriFingerEnv(Env):
     substeps, timestep   physics steps per action and their length in s: the control rate is
                     1 / (substeps * timestep), 25 Hz by default. The paper's 83.3 Hz and 30 s:
                     episode_steps=2500, substeps=3, timestep=0.004.
-    action_mode     "delta": joint target = measured angle + 0.3 rad * action;
+    action_mode     "integrated": joint target = last target + action_scale * action, but at most
+                    LEAD away from the measured angle, so that a zero action keeps a grip;
+                    "delta": joint target = measured angle + action_scale * action;
                     "absolute": the action spans the joint range.
+    action_scale    largest step of a joint target, rad; without effect on "absolute"
+    cube_mass       kg
+    finger_friction of a finger; times that of what it touches (cube 1.0, floor 0.5) in Bullet
     goal_yaw        goal's largest yaw in rad. With 0 rho asks for the position only.
     reward_weights  weights that replace those of REWARD_WEIGHTS, by name (equation 2, A.1)
     render_mode     None, "rgb_array" (headless), or "human" (PyBullet's window, in real time)
@@ -339,14 +352,18 @@ class TriFingerEnv(Env):
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 25}
 
     def __init__(self, task="push", distractors=2, *, episode_steps=125, substeps=5,
-                 timestep=0.008, action_mode="delta", goal_yaw=0.0, reward_weights=None,
-                 render_mode=None):
+                 timestep=0.008, action_mode="integrated", action_scale=0.1, cube_mass=0.08,
+                 finger_friction=1.0, goal_yaw=0.0, reward_weights=None, render_mode=None):
         check_arguments(task, distractors, action_mode, reward_weights, render_mode)
         if episode_steps < 1 or substeps < 1 or not timestep > 0:
             raise ValueError("episode_steps, substeps and timestep must be positive")
+        if not (action_scale > 0 and cube_mass > 0 and finger_friction > 0):
+            raise ValueError("action_scale, cube_mass and finger_friction must be positive")
         self.task, self.distractors = task, int(distractors)
         self.episode_steps, self.substeps, self.timestep = episode_steps, substeps, timestep
-        self.action_mode, self.goal_yaw = action_mode, goal_yaw
+        self.action_mode, self.action_scale = action_mode, action_scale
+        self.cube_mass, self.finger_friction = cube_mass, finger_friction
+        self.goal_yaw = goal_yaw
         self.reward_weights = {**REWARD_WEIGHTS, **(reward_weights or {})}
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1 / (substeps * timestep))}
@@ -406,7 +423,7 @@ class TriFingerEnv(Env):
         # A box, not GEOM_PLANE: Bullet finds one contact a step on a plane, and moving cubes sank.
         table = [2, 2, 0.5]
         floor = self._body(0, table, self._skin([0.97, 0.97, 0.97, 1], table), [0, 0, -0.5])
-        pb.changeDynamics(floor, -1, lateralFriction=FRICTION["floor"], **self._world)
+        pb.changeDynamics(floor, -1, lateralFriction=FLOOR_FRICTION, **self._world)
 
         edge = (WALL + 0.02) * math.tan(math.pi / WALL_SIDES)
         wall = [0.01, edge, 0.1]
@@ -420,17 +437,22 @@ class TriFingerEnv(Env):
             self._body(0, wall, rim, middle, quaternion, shape)
 
     def _build_robot(self):
-        flags = pb.URDF_USE_INERTIA_FROM_FILE | pb.URDF_USE_SELF_COLLISION
+        """Three bodies of three joints: Bullet solves them faster than one of nine."""
+        flags = pb.URDF_USE_INERTIA_FROM_FILE
         if not self.render_mode:
             flags |= pb.URDF_IGNORE_VISUAL_SHAPES
         with tempfile.TemporaryDirectory() as folder:
-            path = os.path.join(folder, "trifinger.urdf")
+            path = os.path.join(folder, "finger.urdf")
             with open(path, "w") as file:
-                file.write(robot_urdf())
-            self._robot = pb.loadURDF(path, useFixedBase=1, flags=flags, **self._world)
-        for j in JOINTS:
-            pb.changeDynamics(self._robot, j, lateralFriction=FRICTION["finger"], linearDamping=0,
-                              angularDamping=0, jointDamping=0, **self._world)
+                file.write(finger_urdf())
+            self._fingers = [
+                pb.loadURDF(path, mount, yaw_quaternion(yaw), useFixedBase=1, flags=flags,
+                            **self._world)
+                for mount, yaw in zip(FINGER_MOUNT, FINGER_YAW)]
+        for finger in self._fingers:
+            for j in JOINTS:
+                pb.changeDynamics(finger, j, lateralFriction=self.finger_friction,
+                                  linearDamping=0, angularDamping=0, jointDamping=0, **self._world)
 
     def _build_cubes(self):
         half = [CUBE / 2] * 3
@@ -438,8 +460,8 @@ class TriFingerEnv(Env):
         skin = self._skin([1, 0, 0, 1], half)
         self._cubes = []
         for i in range(self.distractors + 1):
-            cube = self._body(CUBE_MASS, half, skin, [0, 0, 1 + i], shape=shape)
-            pb.changeDynamics(cube, -1, lateralFriction=FRICTION["cube"], **self._world)
+            cube = self._body(self.cube_mass, half, skin, [0, 0, 1 + i], shape=shape)
+            pb.changeDynamics(cube, -1, lateralFriction=CUBE_FRICTION, **self._world)
             self._cubes.append(cube)
         if self.render_mode:
             green = self._skin([0.2, 0.8, 0.3, 0.5], half)
@@ -516,8 +538,10 @@ class TriFingerEnv(Env):
             pb.resetBasePositionAndOrientation(cube, [x, y, CUBE / 2], yaw_quaternion(yaw),
                                                **self._world)
             pb.resetBaseVelocity(cube, [0, 0, 0], [0, 0, 0], **self._world)
-        for j in JOINTS:
-            pb.resetJointState(self._robot, j, REST[j % 3], 0.0, **self._world)
+        for finger in self._fingers:
+            for j in JOINTS:
+                pb.resetJointState(finger, j, REST[j], 0.0, **self._world)
+        self._targets = list(REST * 3)
         self._steps = 0
         if self.render_mode:
             self._paint()
@@ -542,7 +566,8 @@ class TriFingerEnv(Env):
         """
         if self._steps is None:
             raise RuntimeError("call reset() before step()")
-        self._drive(self._joint_targets(nine_numbers(action)))
+        self._targets = self._joint_targets(nine_numbers(action))
+        self._drive()
         self._steps += 1
         reason = self._read()
         if reason == "the physics diverged":
@@ -562,25 +587,33 @@ class TriFingerEnv(Env):
 
     def _joint_targets(self, action):
         """Angles (9,) in rad that an action asks the joints for."""
-        if self.action_mode == "delta":
-            targets = [q + DELTA * a for q, a in zip(self._q, action)]
+        scale = self.action_scale
+        if self.action_mode == "integrated":
+            # Targets that stay press on: a grip outlives the action that made it.
+            moved = [target + scale * a for target, a in zip(self._targets, action)]
+            targets = clip(moved, [q - LEAD for q in self._q], [q + LEAD for q in self._q])
+        elif self.action_mode == "delta":
+            targets = [q + scale * a for q, a in zip(self._q, action)]
         else:                                                  # from [-1, 1] to the joint range
             targets = [low + (high - low) * (a + 1) / 2
                        for a, low, high in zip(action, LOWER * 3, UPPER * 3)]
         return clip(targets, LOWER * 3, UPPER * 3)
 
-    def _drive(self, targets):
-        """Let the physics run for one action with the joints drawn to `targets`."""
-        pb.setJointMotorControlArray(self._robot, JOINTS, pb.POSITION_CONTROL,
-                                     targetPositions=targets, forces=(TORQUE,) * 9, **self._world)
-        client = self._client                                  # by place: keywords cost time
+    def _drive(self):
+        """Let the physics run for one action with the joints drawn to their targets."""
+        client, targets = self._client, self._targets
+        for k, finger in enumerate(self._fingers):
+            pb.setJointMotorControlArray(finger, JOINTS, pb.POSITION_CONTROL,
+                                         targetPositions=targets[3 * k:3 * k + 3],
+                                         forces=(TORQUE,) * 3, physicsClientId=client)
         for _ in range(self.substeps):
             pb.stepSimulation(client)
 
     def _read(self):
         """Read joints and cubes from the simulator. Returns a reason to cut the episode short."""
         client, reason = self._client, None
-        states = pb.getJointStates(self._robot, JOINTS, client)
+        states = [state for finger in self._fingers
+                  for state in pb.getJointStates(finger, JOINTS, client)]
         self._q, self._dq, _, _ = zip(*states)
         self._poses, rows = [], []
         for cube, identifier in zip(self._cubes, self._ids):
@@ -601,8 +634,7 @@ class TriFingerEnv(Env):
 
     def _measure(self):
         """The Moment of what _read() read."""
-        q = self._q
-        tips = [forward_kinematics(k, q[3 * k:3 * k + 3]) for k in range(3)]
+        tips = fingertips(self._q)
         pose = self._poses[self.target]
         position = pose[0]
         a, b, c = tips
@@ -613,7 +645,8 @@ class TriFingerEnv(Env):
     def _observe(self):
         """The observation of Table 1 from what _read() read, scaled, in fresh arrays."""
         q, dq = self._q, self._dq
-        a, b, c = self._moment.tips
+        is_integrated = self.action_mode == "integrated"
+        a, b, c = fingertips(self._targets) if is_integrated else self._moment.tips
         flat = (*self._cube_rows,                              # (N+1) x 18
                 *q[:3], *dq[:3], -1.0, *a,                     # 3 x 10: q dq identifier tip
                 *q[3:6], *dq[3:6], 0.0, *b,
@@ -703,8 +736,9 @@ def check_arguments(task, distractors, action_mode, reward_weights, render_mode)
     if not is_integer or not 0 <= distractors <= most:
         raise ValueError(f"the arena holds {most + 1} cubes: distractors must be an integer from 0 "
                          f"to {most}, got {distractors!r}")
-    if action_mode not in ("delta", "absolute"):
-        raise ValueError(f"action_mode must be 'delta' or 'absolute', got {action_mode!r}")
+    if action_mode not in ("integrated", "delta", "absolute"):
+        raise ValueError(f"action_mode must be 'integrated', 'delta' or 'absolute', "
+                         f"got {action_mode!r}")
     if unknown:
         raise ValueError(f"reward_weights knows {list(REWARD_WEIGHTS)}, got {sorted(unknown)}")
     if render_mode not in (None, "rgb_array", "human"):

@@ -1,0 +1,94 @@
+"""Can LiftingCube be solved at all? A script without feedback, by inverse kinematics, at N = 0.
+
+    python results/scripted_lift.py                   200 episodes: the table of results/README.md
+    python results/scripted_lift.py --episodes 5      a quick look
+
+The fingertips close round the cube, press inwards, and carry it to the goal in a straight line, in
+90 of an episode's 125 actions; zero actions then hold it. Of several ways to take hold of the cube
+(where on its sides, how high) the script takes the first one that needs no joint beyond its limits.
+"""
+import argparse
+import math
+import os
+import sys
+
+import numpy as np
+
+sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), ".."))
+from trifinger_env import (CUBE, FINGER_YAW, LOWER, SOLVED, UPPER, TriFingerEnv,  # noqa: E402
+                           inverse_kinematics)
+
+BEARINGS = [yaw + math.pi for yaw in FINGER_YAW]               # every finger on its own side
+AROUND, PRESSED = 0.08, CUBE / 2 - 0.02                        # tips' distance from the middle, m
+TURNS = [sign * turn for turn in np.arange(0.0, 0.9, 0.15) for sign in (1, -1)]
+HEIGHTS = (0.035, 0.045, 0.03, 0.055)                          # of the grasp, m
+BANDS = ((0.0, 0.05), (0.05, 0.1), (0.1, 0.15), (0.15, 0.2))   # heights of a goal, m
+
+
+def joint_angles(centre, radius, turn):
+    """Nine angles that bring the tips to a circle round `centre` (x, y, z); None: impossible."""
+    angles = []
+    for k, bearing in enumerate(BEARINGS):
+        x = centre[0] + radius * math.cos(bearing + turn)
+        y = centre[1] + radius * math.sin(bearing + turn)
+        try:
+            angles += inverse_kinematics(k, (x, y, centre[2]))
+        except ValueError:
+            return None
+    is_within = all(low <= q <= high for q, low, high in zip(angles, LOWER * 3, UPPER * 3))
+    return angles if is_within else None
+
+
+def waypoints(cube, goal, turn, height):
+    """What the tips do: [(joint angles, number of actions)]; None if some angles are impossible."""
+    above, beside = (*cube[:2], AROUND), (*cube[:2], height)
+    offset = np.array([0.0, 0.0, height - CUBE / 2])           # of the grasp from the cube's middle
+    way = [(joint_angles(above, AROUND, turn), 15), (joint_angles(beside, AROUND, turn), 10),
+           (joint_angles(beside, PRESSED, turn), 25)]
+    for share in np.arange(1, 26) / 25:
+        at = np.add(cube, np.subtract(goal, cube) * share) + offset
+        way.append((joint_angles(at, PRESSED, turn), 1))
+    return None if any(angles is None for angles, _ in way) else way
+
+
+def play(env, seed):
+    """One episode. Returns the goal's height and the last step's info; None without a way."""
+    env.reset(seed=seed)
+    cube, goal = env._poses[env.target][0], env.goal[0]
+    ways = (waypoints(cube, goal, turn, height) for height in HEIGHTS for turn in TURNS)
+    way = next(filter(None, ways), None)
+    if way is None:
+        return goal[2], None
+    for angles, actions in way:
+        for left in range(actions, 0, -1):
+            env.step(np.subtract(angles, env._targets) / left / env.action_scale)
+    truncated = False
+    while not truncated:                                       # zero actions keep the grip
+        _, _, _, truncated, info = env.step(np.zeros(9))
+    return goal[2], info
+
+
+def main():
+    parser = argparse.ArgumentParser(description="LiftingCube by inverse kinematics.")
+    parser.add_argument("--episodes", type=int, default=200, metavar="E", help="default 200")
+    episodes = parser.parse_args().episodes
+    env = TriFingerEnv("lift", 0)
+    rows = []
+    for seed in range(episodes):
+        height, info = play(env, seed)
+        scores = (0.0, 0.0) if info is None else (info["fractional_success"],
+                                                  info["fractional_success_strict"])
+        rows.append((height, *scores, info is not None))
+    env.close()
+    heights, success, strict, possible = np.array(rows, float).T
+    print("goal's height | episodes | a way was found | success | strict | solved")
+    for low, high in (*BANDS, (0.0, 0.2)):
+        at = (low < heights) & (heights <= high)
+        if at.any():
+            print(f"{low:.2f} to {high:.2f} m | {at.sum()} | {possible[at].mean():.2f} | "
+                  f"{success[at].mean():.2f} | {strict[at].mean():.2f} | "
+                  f"{(success[at] >= SOLVED).mean():.2f}")
+
+
+if __name__ == "__main__":
+    main()
