@@ -641,6 +641,13 @@ def test_a_cube_can_be_lifted_and_held(task):
     assert heights.max() < 0.05, heights.max()
 
 
+def test_a_cube_is_held_in_long_steps_as_in_short_ones():
+    long_steps = grasp_and_raise("lift", substeps=5, timestep=0.008)
+    short_steps = grasp_and_raise("lift", substeps=20, timestep=0.002)
+    assert short_steps.min() > 0.14
+    assert np.abs(long_steps - short_steps)[25:].max() < 0.001             # after a second
+
+
 # ---------------------------------------------------------------- the robot's picture
 
 def drawn(link):
@@ -2099,6 +2106,15 @@ def test_paper_sets_the_numbers_that_the_paper_prints(tmp_path):
     assert settings == {**train.DEFAULTS, "frames": 77, "anneal_lr": False}
 
 
+def test_lifting_has_frames_of_its_own(tmp_path):
+    out = str(tmp_path / "run")
+    for words, frames in (("", 3_000_000), ("--task lift", 8_000_000), ("--paper", 60_000_000),
+                          ("--task lift --paper", 60_000_000), ("--task lift --frames 9", 9),
+                          ("--task lift --set frames=7", 7)):
+        _, settings = train.parse(["--out", out, *words.split()])
+        assert settings["frames"] == frames, words
+
+
 def test_the_default_run_is_named_after_what_it_trains():
     args = train.read_command(["--task", "lift", "--encoder", "rn", "--seed", "4"])
     assert args.out == os.path.join("runs", "lift-rn-n2-seed4")
@@ -3040,19 +3056,23 @@ def test_a_film_from_the_command_line(trained, tmp_path, command):
 # ---------------------------------------------------------------- results/
 
 @pytest.mark.parametrize("script", ["reweigh.py", "profile_training.py", "encoder_speed.py",
-                                    "grasp.py"])
+                                    "grasp.py", "scripted_lift.py", "phases.py"])
 def test_scripts_of_results_run(script, trained):
     arguments = {
         "reweigh.py": [trained, "--distractors", "1", "--episodes", "2"],
         "profile_training.py": ["--updates", "1"],
         "encoder_speed.py": ["--repeats", "1"],
         "grasp.py": ["--tries", "1"],
+        "scripted_lift.py": ["--episodes", "2"],
+        "phases.py": [trained, "--distractors", "1", "--episodes", "2"],
     }
     words = {
         "reweigh.py": ["as it is", "distractors reweighed", "lengths: a distractor"],
         "profile_training.py": ["ms a frame", "bare physics", "update"],
         "encoder_speed.py": ["LRN: K=12", "RN: K=12", "slope"],
         "grasp.py": ["0.08 kg | 0.00"],
+        "scripted_lift.py": ["0.00 to 0.20 m | 2 | 1.00"],
+        "phases.py": ["lrn | 1 | 0.00 to 0.20 m | 2"],
     }
     done = run(os.path.join("results", script), *arguments[script])
     assert done.returncode == 0, done.stderr
@@ -3521,6 +3541,8 @@ MUTATIONS = {
          "test_every_setting_reaches_the_learner_and_its_environments"),
         ("setting.paper if args.paper else setting.default", "setting.default",
          "test_paper_sets_the_numbers_that_the_paper_prints"),
+        ("if args.task == \"lift\" and not args.paper:", "if args.task == \"lift\":",
+         "test_lifting_has_frames_of_its_own"),
         ("Setting(0.2, 0.5, \"A.2\")", "Setting(0.2, 0.2, \"A.2\")",
          "test_paper_sets_the_numbers_that_the_paper_prints"),
         ("        refuse_if_without_effect(name, args.encoder)\n", "",
