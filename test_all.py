@@ -3166,6 +3166,37 @@ def test_figures_are_drawn_and_tables_printed(tmp_path):
     assert (tmp_path / "figure3.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_shipped_curves_stand_for_windows_of_updates(results_scripts, monkeypatch):
+    """7 updates in at most 3 rows: windows of 3, 3 and 1."""
+    import ship
+
+    monkeypatch.setattr(ship, "ROWS", 3)
+    rows = [{"update": f"{u}", "frames": f"{10 * u}", "episodes": "4", "success_aabb": f"{u / 10}"}
+            for u in range(1, 8)]
+    found = [{key: float(value) for key, value in row.items()} for row in ship.thinned(rows)]
+    assert found == [{"update": 3, "frames": 30, "episodes": 12, "success_aabb": 0.2},
+                     {"update": 6, "frames": 60, "episodes": 12, "success_aabb": 0.5},
+                     {"update": 7, "frames": 70, "episodes": 4, "success_aabb": 0.7}]
+    assert ship.thinned(rows[:3]) == rows[:3]
+
+
+def test_a_shipped_run_has_the_same_weights_and_no_optimiser(trained, tmp_path, results_scripts):
+    import ship
+
+    ship.ship(trained, str(tmp_path / "shipped"))
+    small, agent = train.load(str(tmp_path / "shipped"))
+    whole, expected = train.load(trained)
+    assert "optimizer" in whole and "optimizer" not in small
+    assert small["settings"] == whole["settings"]
+    for name, value in expected.state_dict().items():
+        assert torch.equal(agent.state_dict()[name], value), name
+    sizes = [os.path.getsize(os.path.join(folder, "checkpoint.pt"))
+             for folder in (trained, tmp_path / "shipped")]
+    assert sizes[1] < 0.5 * sizes[0]
+    assert sorted(os.listdir(tmp_path / "shipped")) == ["checkpoint.pt", "progress.csv",
+                                                        "timing.csv"]
+
+
 # ---------------------------------------------------------------- every module
 
 @pytest.mark.parametrize("name", ["lrn.py", "rn.py", "attn.py", "ppo.py", "trifinger_env.py"])

@@ -25,13 +25,11 @@ MEASURES = {                             # column of zeroshot.csv -> title of it
 }
 # Student's t for a 95 % interval, by the number of seeds
 STUDENT = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776}
-GROUPS = ("push-lrn-n2", "push-lrn-max-n2", "push-rn-n2", "push-attn-n2", "push-mlp-n2",
-          "push-lrn-n9", "push-lrn-max-n9")
-LINES = {                                # of figure 3: group -> label, colour
-    "push-lrn-n2": ("LRN", "#0072B2"),
-    "push-lrn-max-n2": ("LRN-max (ours)", "#E69F00"),
-    "push-rn-n2": ("RN", "#009E73"),
-    "push-attn-n2": ("ATTN", "#CC3311"),
+TASKS = {"push": "PushingCube", "lift": "LiftingCube"}
+LINES = {                                # of figure 3: encoder -> label, colour
+    "lrn": ("LRN", "#0072B2"),
+    "rn": ("RN", "#009E73"),
+    "attn": ("ATTN", "#CC3311"),
 }
 WINDOW = 50                              # updates that a point of a training curve averages
 
@@ -56,8 +54,9 @@ def read(run, name):
 
 
 def shipped_runs():
-    """Run folders of GROUPS in this folder, seed by seed."""
-    return [run for name in GROUPS for run in sorted(glob.glob(f"{HERE}/{name}-seed?"))]
+    """Run folders in this folder: task by task, encoder by encoder, seed by seed."""
+    return [run for task in TASKS for encoder in LINES
+            for run in sorted(glob.glob(f"{HERE}/{task}-{encoder}-n*-seed?"))]
 
 
 def by_seed(runs):
@@ -166,9 +165,12 @@ def pyplot():
     return pyplot
 
 
-def smooth(values):
-    """Mean of each WINDOW updates."""
-    return np.convolve(values, np.ones(WINDOW) / WINDOW, "valid")
+def smooth(rows, name):
+    """Frames in millions and the means of a column over WINDOW updates; a row may stand for several
+    updates (ship.py)."""
+    count = max(round(WINDOW * len(rows["update"]) / rows["update"][-1]), 1)
+    means = np.convolve(rows[name], np.ones(count) / count, "valid")
+    return rows["frames"][count - 1:] / 1e6, means
 
 
 def draw(axes, x, curves, label, color, marker=None):
@@ -179,24 +181,27 @@ def draw(axes, x, curves, label, color, marker=None):
 
 
 def figure_3(folder):
-    """Figure 3, upper half: training at 2 distractors (left), zero-shot at others (right)."""
+    """Figure 3: training at 2 distractors (left), zero-shot at others (right); a row for a task."""
     plt = pyplot()
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
+    figure, axes = plt.subplots(2, 2, figsize=(9, 7.5), layout="constrained")
     groups = by_seed(shipped_runs())
-    for name, (label, color) in LINES.items():
-        runs = groups[name]
-        label += f", {len(runs)} seeds" if len(runs) > 1 else ", 1 seed"
-        progress = [read(run, "progress.csv") for run in runs]
-        frames = progress[0]["frames"][WINDOW - 1:] / 1e6
-        draw(left, frames, [smooth(rows["success_aabb"]) for rows in progress], label, color)
-        cells = over_seeds(runs, "success_aabb")
-        values = np.array([cells[n].values for n in cells]).T              # (S, numbers)
-        draw(right, list(cells), values, label, color, marker="o")
-    left.set(title="PushingCube: training at N = 2", xlabel="million frames",
-             ylabel="fractional success (axis-aligned)", ylim=(0, 1))
-    right.set(title="PushingCube: zero-shot", xlabel="N, distractors at test time", ylim=(0, 1),
-              xticks=[0, 2, 5, 9, 14, 19])
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    for (task, title), (left, right) in zip(TASKS.items(), axes):
+        for encoder, (label, color) in LINES.items():
+            runs = groups.get(f"{task}-{encoder}-n2")
+            if not runs:
+                continue
+            label += f", {len(runs)} seeds" if len(runs) > 1 else ", 1 seed"
+            progress = [read(run, "progress.csv") for run in runs]
+            frames, _ = smooth(progress[0], "success_aabb")
+            curves = [smooth(rows, "success_aabb")[1] for rows in progress]
+            draw(left, frames, curves, label, color)
+            cells = over_seeds(runs, "success_aabb")
+            values = np.array([cells[n].values for n in cells]).T          # (S, numbers)
+            draw(right, list(cells), values, label, color, marker="o")
+        left.set(title=f"{title}: training at N = 2", xlabel="million frames",
+                 ylabel="fractional success (axis-aligned)", ylim=(0, 1))
+        right.set(title=f"{title}: zero-shot", xlabel="N, distractors at test time", ylim=(0, 1))
+        left.legend(loc="lower right")
     save(figure, folder, "figure3.png")
 
 
