@@ -3056,7 +3056,7 @@ def test_a_film_from_the_command_line(trained, tmp_path, command):
 # ---------------------------------------------------------------- results/
 
 @pytest.mark.parametrize("script", ["reweigh.py", "profile_training.py", "encoder_speed.py",
-                                    "grasp.py", "scripted_lift.py", "phases.py"])
+                                    "grasp.py", "scripted_lift.py", "phases.py", "search.py"])
 def test_scripts_of_results_run(script, trained):
     arguments = {
         "reweigh.py": [trained, "--distractors", "1", "--episodes", "2"],
@@ -3065,6 +3065,7 @@ def test_scripts_of_results_run(script, trained):
         "grasp.py": ["--tries", "1"],
         "scripted_lift.py": ["--episodes", "2"],
         "phases.py": [trained, "--distractors", "1", "--episodes", "2"],
+        "search.py": [],
     }
     words = {
         "reweigh.py": ["as it is", "distractors reweighed", "lengths: a distractor"],
@@ -3073,6 +3074,7 @@ def test_scripts_of_results_run(script, trained):
         "grasp.py": ["0.08 kg | 0.00"],
         "scripted_lift.py": ["0.00 to 0.20 m | 2 | 1.00"],
         "phases.py": ["lrn | 1 | 0.00 to 0.20 m | 2"],
+        "search.py": ["| push-first | 0.0"],
     }
     done = run(os.path.join("results", script), *arguments[script])
     assert done.returncode == 0, done.stderr
@@ -3157,7 +3159,7 @@ def test_table_puts_seeds_together(tmp_path, results_scripts):
 def test_figures_are_drawn_and_tables_printed(tmp_path):
     done = run("results/figures.py", "table")
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("| push-lrn-n2 | 3 |") == 3       # one row in each of three tables
+    assert done.stdout.count("| push-lrn-n2 | ") == 3       # one row in each of three tables
     done = run("results/figures.py", "8")
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (optional)")

@@ -1,4 +1,4 @@
-"""Can a cube be held at all? A scripted three-finger grasp, by mass and friction; nothing is learnt.
+"""Can a cube be held at all? A scripted three-finger grasp by mass and friction; nothing is learnt.
 
     python results/grasp.py                  60 tries a cell: the table of results/README.md
     python results/grasp.py --tries 2        a quick look
