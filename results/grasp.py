@@ -22,15 +22,21 @@ from trifinger_env import (CUBE, FINGER_YAW, LOWER, UPPER, TriFingerEnv,  # noqa
 BEARINGS = [yaw + math.pi for yaw in FINGER_YAW]               # every finger grasps on its own side
 
 
-def tip_action(centre, radius, height, turn):
-    """Action of mode "absolute" that brings the tips to a circle round `centre` (x, y)."""
-    action = []
+def joint_angles(centre, radius, height, turn):
+    """Nine angles that bring the tips to a circle round `centre` (x, y); ValueError: too far."""
+    angles = []
     for k, bearing in enumerate(BEARINGS):
         x = centre[0] + radius * math.cos(bearing + turn)
         y = centre[1] + radius * math.sin(bearing + turn)
-        for q, low, high in zip(inverse_kinematics(k, (x, y, height)), LOWER, UPPER):
-            action.append(2 * (q - low) / (high - low) - 1)
-    return action
+        angles += inverse_kinematics(k, (x, y, height))
+    return angles
+
+
+def tip_action(centre, radius, height, turn):
+    """Action of mode "absolute" that brings the tips there."""
+    angles = joint_angles(centre, radius, height, turn)
+    return [2 * (q - low) / (high - low) - 1
+            for q, low, high in zip(angles, LOWER * 3, UPPER * 3)]
 
 
 def grasp(env, centre, yaw, depth, height, turn, lift=0.15):

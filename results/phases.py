@@ -1,6 +1,6 @@
 """How far do lifting episodes come, by height of the goal?
 
-    python results/phases.py results/lift-lrn-n2-seed0                    200 episodes at N = 2
+    python results/phases.py results/lift-longest                         200 episodes at N = 2
     python results/phases.py RUN [RUN ...] --distractors 9 --episodes 100
 
 Prints one row per band of goal heights: the score at the end (axis-aligned and strict), the best
@@ -19,10 +19,10 @@ import torch
 
 sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), ".."))
 import evaluate  # noqa: E402
+from scripted_lift import bands  # noqa: E402
 from train import fail, load  # noqa: E402
 from trifinger_env import SOLVED  # noqa: E402
 
-BANDS = ((0.0, 0.05), (0.05, 0.1), (0.1, 0.15), (0.15, 0.2))   # heights of a goal, m
 COLUMNS = ("success", "strict", "best", "reached", "raised", "above", "placed", "kept")
 
 
@@ -86,12 +86,10 @@ def main():
             heights, rows = watch(run, args.distractors, args.episodes)
         except ValueError as error:
             fail(str(error))
-        for low, high in (*BANDS, (0.0, 0.2)):
-            at = (low < heights) & (heights <= high)
-            if at.any():
-                means = " | ".join(f"{mean:.2f}" for mean in rows[at].mean(axis=0))
-                print(f"{os.path.basename(os.path.normpath(run))} | {args.distractors} | "
-                      f"{low:.2f} to {high:.2f} m | {at.sum()} | {means}", flush=True)
+        for label, at in bands(heights):
+            means = " | ".join(f"{mean:.2f}" for mean in rows[at].mean(axis=0))
+            print(f"{os.path.basename(os.path.normpath(run))} | {args.distractors} | {label} | "
+                  f"{at.sum()} | {means}", flush=True)
 
 
 if __name__ == "__main__":

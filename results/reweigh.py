@@ -6,7 +6,7 @@
 LRN, RN and ATTN all sum one vector per token (or pair of tokens). Trained with T distractors and
 played with N, each distractor's term is here counted T / N times, so that together they weigh as
 much as in training. Prints the score and the read error as it is and reweighed. For LRN also
-what each object adds to f's output, as a mean length. Output of the shipped runs: reweighed.txt.
+what each object adds to f's output, as a mean length.
 """
 import argparse
 import os

@@ -8,33 +8,27 @@ The fingertips close round the cube, press inwards, and carry it to the goal in 
 (where on its sides, how high) the script takes the first one that needs no joint beyond its limits.
 """
 import argparse
-import math
 import os
 import sys
 
 import numpy as np
 
 sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), ".."))
-from trifinger_env import (CUBE, FINGER_YAW, LOWER, SOLVED, UPPER, TriFingerEnv,  # noqa: E402
-                           inverse_kinematics)
+from grasp import joint_angles  # noqa: E402
+from trifinger_env import CUBE, LOWER, SOLVED, UPPER, TriFingerEnv  # noqa: E402
 
-BEARINGS = [yaw + math.pi for yaw in FINGER_YAW]               # every finger on its own side
 AROUND, PRESSED = 0.08, CUBE / 2 - 0.02                        # tips' distance from the middle, m
 TURNS = [sign * turn for turn in np.arange(0.0, 0.9, 0.15) for sign in (1, -1)]
 HEIGHTS = (0.035, 0.045, 0.03, 0.055)                          # of the grasp, m
 BANDS = ((0.0, 0.05), (0.05, 0.1), (0.1, 0.15), (0.15, 0.2))   # heights of a goal, m
 
 
-def joint_angles(centre, radius, turn):
-    """Nine angles that bring the tips to a circle round `centre` (x, y, z); None: impossible."""
-    angles = []
-    for k, bearing in enumerate(BEARINGS):
-        x = centre[0] + radius * math.cos(bearing + turn)
-        y = centre[1] + radius * math.sin(bearing + turn)
-        try:
-            angles += inverse_kinematics(k, (x, y, centre[2]))
-        except ValueError:
-            return None
+def possible_angles(centre, radius, turn):
+    """Nine angles for tips on a circle round `centre` (x, y, z); None: out of reach or limits."""
+    try:
+        angles = joint_angles(centre[:2], radius, centre[2], turn)
+    except ValueError:
+        return None
     is_within = all(low <= q <= high for q, low, high in zip(angles, LOWER * 3, UPPER * 3))
     return angles if is_within else None
 
@@ -43,11 +37,11 @@ def waypoints(cube, goal, turn, height):
     """What the tips do: [(joint angles, number of actions)]; None if some angles are impossible."""
     above, beside = (*cube[:2], AROUND), (*cube[:2], height)
     offset = np.array([0.0, 0.0, height - CUBE / 2])           # of the grasp from the cube's middle
-    way = [(joint_angles(above, AROUND, turn), 15), (joint_angles(beside, AROUND, turn), 10),
-           (joint_angles(beside, PRESSED, turn), 25)]
+    way = [(possible_angles(above, AROUND, turn), 15), (possible_angles(beside, AROUND, turn), 10),
+           (possible_angles(beside, PRESSED, turn), 25)]
     for share in np.arange(1, 26) / 25:
         at = np.add(cube, np.subtract(goal, cube) * share) + offset
-        way.append((joint_angles(at, PRESSED, turn), 1))
+        way.append((possible_angles(at, PRESSED, turn), 1))
     return None if any(angles is None for angles, _ in way) else way
 
 
@@ -68,6 +62,13 @@ def play(env, seed):
     return goal[2], info
 
 
+def bands(heights):
+    """[(label, which of the heights lie in it)] of every band that is not empty, and of all."""
+    found = [(f"{low:.2f} to {high:.2f} m", (low < heights) & (heights <= high))
+             for low, high in (*BANDS, (0.0, 0.2))]
+    return [(label, at) for label, at in found if at.any()]
+
+
 def main():
     parser = argparse.ArgumentParser(description="LiftingCube by inverse kinematics.")
     parser.add_argument("--episodes", type=int, default=200, metavar="E", help="default 200")
@@ -82,12 +83,9 @@ def main():
     env.close()
     heights, success, strict, possible = np.array(rows, float).T
     print("goal's height | episodes | a way was found | success | strict | solved")
-    for low, high in (*BANDS, (0.0, 0.2)):
-        at = (low < heights) & (heights <= high)
-        if at.any():
-            print(f"{low:.2f} to {high:.2f} m | {at.sum()} | {possible[at].mean():.2f} | "
-                  f"{success[at].mean():.2f} | {strict[at].mean():.2f} | "
-                  f"{(success[at] >= SOLVED).mean():.2f}")
+    for label, at in bands(heights):
+        print(f"{label} | {at.sum()} | {possible[at].mean():.2f} | {success[at].mean():.2f} | "
+              f"{strict[at].mean():.2f} | {(success[at] >= SOLVED).mean():.2f}")
 
 
 if __name__ == "__main__":
