@@ -2,12 +2,14 @@
 
     python evaluate.py RUN                                   N = 0..9, 200 episodes each: a table
     python evaluate.py RUN [RUN ...] --distractors 0-9,14 --save       and RUN/zeroshot.csv
-    python evaluate.py RUN --mean-actions                    without sampling noise
+    python evaluate.py RUN --sample-actions                  with the noise of training
     python evaluate.py RUN --watch                           watch it play, live in a window
     python evaluate.py RUN --gif push.gif --distractors 9    a film of one episode
 
 Episode j starts from the same seed at every N and for every agent: goal and target cube stand in
-the same places, only the distractors differ. The seeds belong to no training run.
+the same places, only the distractors differ. The seeds belong to no training run. The paper does
+not say whether its scores are of sampled actions or of the policy's means; CausalWorld's evaluation
+plays the means, and so do we.
 """
 import argparse
 import csv
@@ -109,21 +111,21 @@ def first_look(agent, observations, z, z_trained, has_read_out):
     return drift.tolist(), error.tolist()
 
 
-def actions(agent, observations, noise, mean_actions):
-    """Actions (B, 9), sampled with one generator of `noise` per episode, or the policy's means."""
+def actions(agent, observations, noise, sample_actions):
+    """Actions (B, 9): the policy's means, or sampled with one generator of `noise` per episode."""
     mean, log_std, _ = agent(as_batch(observations))
-    if mean_actions:
+    if not sample_actions:
         return mean.numpy()
     std = log_std.exp().numpy()
     return [m + std * generator.standard_normal(9) for m, generator in zip(mean.numpy(), noise)]
 
 
-def to_the_end(agent, envs, observations, seeds, mean_actions):
+def to_the_end(agent, envs, observations, seeds, sample_actions):
     """Play every environment until its episode ends; the info of each last step."""
     noise = [np.random.default_rng(seed) for seed in seeds]
     ends = [None] * len(envs)
     while None in ends:
-        for e, action in enumerate(actions(agent, observations, noise, mean_actions)):
+        for e, action in enumerate(actions(agent, observations, noise, sample_actions)):
             if ends[e] is None:
                 observations[e], _, _, truncated, info = envs[e].step(action)
                 if truncated:
@@ -132,7 +134,7 @@ def to_the_end(agent, envs, observations, seeds, mean_actions):
 
 
 @torch.inference_mode()
-def play(path, distractors, first, count, mean_actions):
+def play(path, distractors, first, count, sample_actions):
     """Play episodes first .. first+count-1 of the agent in `path`: a list of Episodes."""
     torch.set_num_threads(1)
     checkpoint, agent = load(path)
@@ -142,7 +144,7 @@ def play(path, distractors, first, count, mean_actions):
     z_trained = trained_z(path, first, count)
     drift, read_error = first_look(agent, observations, z, z_trained, has_read_out)
     blocked = [is_blocked(obs) for obs in observations]
-    ends = to_the_end(agent, envs, observations, seeds, mean_actions)
+    ends = to_the_end(agent, envs, observations, seeds, sample_actions)
     for env in envs:
         env.close()
     return [Episode(info["fractional_success"], info["fractional_success_strict"],
@@ -199,7 +201,7 @@ def print_row(row, seconds_left):
           f"{row['z_drift']:11.3f} {1000 * row['read_error']:16.1f}  {left}", flush=True)
 
 
-def evaluate(run, distractors, episodes, mean_actions=False):
+def evaluate(run, distractors, episodes, sample_actions=False):
     """Play `episodes` episodes at every N in `distractors` on all cores.
 
     Prints and returns rows, each as soon as its N is done.
@@ -213,10 +215,10 @@ def evaluate(run, distractors, episodes, mean_actions=False):
         return []
     print(f"{run}: {checkpoint['encoder']} trained on {checkpoint['task']} with {trained} "
           f"distractors, {checkpoint['frames']} frames; {episodes} episodes each, "
-          f"{'mean' if mean_actions else 'sampled'} actions")
+          f"{'sampled' if sample_actions else 'mean'} actions")
     print(HEADER, flush=True)
     firsts = range(0, episodes, CHUNK)
-    chunks = [(run, n, first, min(CHUNK, episodes - first), mean_actions)
+    chunks = [(run, n, first, min(CHUNK, episodes - first), sample_actions)
               for n in distractors for first in firsts]
     # Ctrl-C is for the main process alone: leaving the pool ends the others.
     ignore_ctrl_c = signal.signal, (signal.SIGINT, signal.SIG_IGN)
@@ -266,20 +268,20 @@ def check_csv(path):
 
 # ---- watching
 
-def play_live(agent, env, episode, mean_actions):
+def play_live(agent, env, episode, sample_actions):
     """Play one evaluation episode; yields the info at the start and after every step."""
     noise = [np.random.default_rng(episode_seed(episode))]
     obs, info = env.reset(seed=episode_seed(episode))
     yield info
     truncated = False
     while not truncated:
-        action, = actions(agent, [obs], noise, mean_actions)
+        action, = actions(agent, [obs], noise, sample_actions)
         obs, _, _, truncated, info = env.step(action)
         yield info
 
 
 @torch.inference_mode()
-def watch(run, distractors, episodes, mean_actions):
+def watch(run, distractors, episodes, sample_actions):
     """Play episodes in PyBullet's window, in real time, until it is closed or Ctrl-C."""
     checkpoint, agent = load(run)
     env = make_env(checkpoint["task"], distractors, checkpoint["settings"], render_mode="human")
@@ -287,7 +289,7 @@ def watch(run, distractors, episodes, mean_actions):
           f"green, distractors red; close the window or press Ctrl-C to stop", flush=True)
     try:
         for episode in range(episodes):
-            for info in play_live(agent, env, episode, mean_actions):
+            for info in play_live(agent, env, episode, sample_actions):
                 pass
             print(f"episode {episode}: fractional success {info['fractional_success']:.2f}",
                   flush=True)
@@ -299,7 +301,7 @@ def watch(run, distractors, episodes, mean_actions):
 
 
 @torch.inference_mode()
-def film(run, distractors, mean_actions, path, episode=0):
+def film(run, distractors, sample_actions, path, episode=0):
     """Write one evaluation episode as an animated GIF."""
     try:
         from PIL import Image
@@ -309,7 +311,7 @@ def film(run, distractors, mean_actions, path, episode=0):
     env = make_env(checkpoint["task"], distractors, checkpoint["settings"], "rgb_array")
     every = max(1, round(0.08 / (env.substeps * env.timestep)))            # 12 pictures a second
     pictures = []
-    for step, info in enumerate(play_live(agent, env, episode, mean_actions)):
+    for step, info in enumerate(play_live(agent, env, episode, sample_actions)):
         if step % every == 0:
             pictures.append(Image.fromarray(env.render(320, 240)))
     env.close()
@@ -343,10 +345,10 @@ def read_command():
     add("--distractors", metavar="LIST",
         help="numbers of distractors, as 0-9 or 0,2,14 (default 0-9; to watch: as trained)")
     add("--episodes", type=int, default=200, metavar="E", help="episodes at each N (default 200)")
-    add("--mean-actions", action="store_true",
-        help="play the mean of the policy instead of sampling")
+    add("--sample-actions", action="store_true",
+        help="sample actions as in training instead of playing the policy's means")
     add("--save", action="store_true",
-        help="write the rows to RUN/zeroshot.csv (zeroshot-mean.csv for mean actions)")
+        help="write the rows to RUN/zeroshot.csv (zeroshot-sampled.csv for sampled actions)")
     add("--watch", action="store_true", help="play the first run live in a window")
     add("--gif", metavar="FILE", help="film one episode of the first run")
     args = parser.parse_args()
@@ -363,22 +365,22 @@ def show(args):
     trained = load(run)[0]["distractors"]
     distractors = parse_range(args.distractors)[0] if args.distractors else trained
     if args.gif:
-        film(run, distractors, args.mean_actions, args.gif)
+        film(run, distractors, args.sample_actions, args.gif)
     if args.watch:
-        watch(run, distractors, args.episodes, args.mean_actions)
+        watch(run, distractors, args.episodes, args.sample_actions)
 
 
 def sweep(args):
     """Evaluate all runs, after a look at whatever could go wrong."""
     numbers = parse_range(args.distractors or "0-9")
-    name = "zeroshot-mean.csv" if args.mean_actions else "zeroshot.csv"
+    name = "zeroshot-sampled.csv" if args.sample_actions else "zeroshot.csv"
     for run in args.runs:
         checkpoint, _ = load(run)
         make_env(checkpoint["task"], numbers[-1], checkpoint["settings"]).close()
         if args.save:
             check_csv(os.path.join(run, name))
     for run in args.runs:
-        rows = evaluate(run, numbers, args.episodes, args.mean_actions)
+        rows = evaluate(run, numbers, args.episodes, args.sample_actions)
         if args.save and rows:
             save_rows(os.path.join(run, name), rows)
 

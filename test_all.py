@@ -2776,7 +2776,7 @@ def simple(monkeypatch):
     evaluate.trained_z.cache_clear()
 
 
-def slow_play(checkpoint, n, episodes, mean_actions):
+def slow_play(checkpoint, n, episodes, sample_actions):
     """evaluate.play() as a plain loop, one episode after the other."""
     agent, results = Simple(), []
     for episode in episodes:
@@ -2789,7 +2789,7 @@ def slow_play(checkpoint, n, episodes, mean_actions):
         while not truncated:
             mean, log_std, _ = agent(as_batch([obs]))
             action = mean[0].numpy()
-            if not mean_actions:
+            if sample_actions:
                 action = action + math.exp(-1.0) * noise.standard_normal(9)
             obs, _, _, truncated, info = env.step(action)
         results.append((info["fractional_success"], info["fractional_success_strict"],
@@ -2798,10 +2798,10 @@ def slow_play(checkpoint, n, episodes, mean_actions):
     return np.array(results)
 
 
-@pytest.mark.parametrize("n, mean_actions", [(0, True), (2, True), (2, False)])
-def test_play_equals_a_plain_loop_over_episodes(simple, n, mean_actions):
-    ours = evaluate.play("simple", n, 3, 6, mean_actions)
-    expected = slow_play(simple, n, range(3, 9), mean_actions)
+@pytest.mark.parametrize("n, sample_actions", [(0, False), (2, False), (2, True)])
+def test_play_equals_a_plain_loop_over_episodes(simple, n, sample_actions):
+    ours = evaluate.play("simple", n, 3, 6, sample_actions)
+    expected = slow_play(simple, n, range(3, 9), sample_actions)
     np.testing.assert_allclose([episode.rho for episode in ours], expected[:, 0], atol=1e-5)
     np.testing.assert_allclose([episode.strict for episode in ours], expected[:, 1], atol=1e-5)
     np.testing.assert_allclose([episode.read_error for episode in ours], expected[:, 2], atol=1e-5)
@@ -2942,7 +2942,7 @@ def test_evaluation_prints_each_n_as_it_is_done_with_the_time_left(simple, monke
     """60 episodes are three chunks a minute long each: 9 minutes in all for three N."""
     clock, calls, printed = [0.0], [], []
 
-    def play(path, n, first, count, mean_actions):
+    def play(path, n, first, count, sample_actions):
         printed.extend(capsys.readouterr().out.splitlines())
         calls.append((n, first, count, len(printed)))
         clock[0] += 60.0
@@ -2961,7 +2961,7 @@ def test_evaluation_prints_each_n_as_it_is_done_with_the_time_left(simple, monke
     assert "left" not in printed[4]
     assert [row["success_aabb"] for row in rows] == pytest.approx([0.0, 0.2, 0.7])
     assert [row["episodes"] for row in rows] == [60, 60, 60]
-    assert "sampled actions" in printed[0] and "60 episodes each" in printed[0]
+    assert "mean actions" in printed[0] and "60 episodes each" in printed[0]
 
 
 def test_evaluation_leaves_a_run_as_it_is_unless_asked_to_save(trained, tmp_path):
@@ -2999,12 +2999,12 @@ def test_rows_are_saved_in_order_and_other_n_stay(tmp_path):
                      "9,7" + 11 * ",0.2500"]
 
 
-def test_mean_actions_are_saved_apart(trained, tmp_path, command):
+def test_sampled_actions_are_saved_apart(trained, tmp_path, command):
     out = tmp_path / "run"
     shutil.copytree(trained, out)
-    command("evaluate.py --mean-actions --save --distractors 0 --episodes 2", out)
+    command("evaluate.py --sample-actions --save --distractors 0 --episodes 2", out)
     assert not os.path.exists(out / "zeroshot.csv")
-    row, = read_csv(out / "zeroshot-mean.csv")
+    row, = read_csv(out / "zeroshot-sampled.csv")
     episodes = evaluate.play(str(out), 0, 0, 2, True)
     expected = np.mean([episode.rho for episode in episodes])
     assert row["success_aabb"] == pytest.approx(expected, abs=1e-4)
@@ -3022,7 +3022,7 @@ def test_watching_plays_the_evaluated_episodes(simple, monkeypatch, capsys):
         assert render_mode == "human"
         return train.make_env(task, distractors, settings)
 
-    expected = slow_play(simple, 2, range(3), mean_actions=False)[:, 0]
+    expected = slow_play(simple, 2, range(3), sample_actions=False)[:, 0]
     monkeypatch.setattr(evaluate, "make_env", make_env)
     evaluate.watch("simple", 2, 3, False)
     lines = capsys.readouterr().out.splitlines()[1:]
@@ -3041,7 +3041,7 @@ def test_film_shows_one_episode(simple, tmp_path, capsys):
         first = np.array(film.convert("RGB"), int)
         film.seek(7)
         assert np.abs(np.array(film.convert("RGB"), int) - first).max() > 50
-    rho, = slow_play(simple, 2, [0], mean_actions=False)[:, 0]
+    rho, = slow_play(simple, 2, [0], sample_actions=False)[:, 0]
     assert f"fractional success {rho:.2f}" in capsys.readouterr().out
 
 
@@ -3609,7 +3609,7 @@ MUTATIONS = {
          "test_evaluation_starts_belong_to_no_training_run"),
         ("EVALUATION = 20220131", "EVALUATION = 0",
          "test_evaluation_starts_belong_to_no_training_run"),
-        ("    if mean_actions:\n", "    if False:\n",
+        ("    if not sample_actions:\n", "    if False:\n",
          "test_play_equals_a_plain_loop_over_episodes"),
         ("std = log_std.exp().numpy()", "std = log_std.numpy()",
          "test_play_equals_a_plain_loop_over_episodes"),
@@ -3650,8 +3650,9 @@ MUTATIONS = {
          "test_evaluation_leaves_a_run_as_it_is_unless_asked_to_save"),
         ("for n in sorted(lines)", "for n in lines",
          "test_rows_are_saved_in_order_and_other_n_stay"),
-        ("\"zeroshot-mean.csv\" if args.mean_actions else \"zeroshot.csv\"", "\"zeroshot.csv\"",
-         "test_mean_actions_are_saved_apart"),
+        ("\"zeroshot-sampled.csv\" if args.sample_actions else \"zeroshot.csv\"",
+         "\"zeroshot.csv\"",
+         "test_sampled_actions_are_saved_apart"),
         ("reset(seed=episode_seed(episode))", "reset(seed=episode)",
          "test_watching_plays_the_evaluated_episodes"),
         ("default_rng(episode_seed(episode))", "default_rng(episode)",

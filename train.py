@@ -341,7 +341,7 @@ class Run:
         keep_rows(self.path("progress.csv"), PROGRESS, self.update)
         keep_rows(self.path("timing.csv"), TIMING, self.update)
         if self.update < self.updates:
-            for name in ("zeroshot.csv", "zeroshot-mean.csv"):             # of weights that change
+            for name in ("zeroshot.csv", "zeroshot-sampled.csv"):          # of weights that change
                 if os.path.exists(self.path(name)):
                     os.remove(self.path(name))
 

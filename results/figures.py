@@ -1,6 +1,6 @@
 """Draw the figures and print the tables of this folder from the CSV files of its runs.
 
-    python results/figures.py              every figure: results/figure3.png
+    python results/figures.py              every figure: results/figure3.png and others
     python results/figures.py 3            one of them
     python results/figures.py table        the tables, in markdown
     python results/figures.py 3 --out .    into another folder
@@ -30,6 +30,13 @@ LINES = {                                # of figure 3: encoder -> label, colour
     "lrn": ("LRN", "#0072B2"),
     "rn": ("RN", "#009E73"),
     "attn": ("ATTN", "#CC3311"),
+}
+KINDS = {                                # of relations -> colour, those of the paper's figure 7
+    "finger 0": "black",
+    "finger 1": "saddlebrown",
+    "finger 2": "red",
+    "target": "green",
+    "distractors": "blue",
 }
 WINDOW = 50                              # updates that a point of a training curve averages
 
@@ -208,13 +215,48 @@ def figure_3(folder):
     save(figure, folder, "figure3.png")
 
 
+def figure_7(folder):
+    """Figure 7: LRN's relations in the plane, coloured by kind (t-SNE, N = 3 to 6)."""
+    plt = pyplot()
+    rows = read_text("figure7.csv")
+    figure, axes = plt.subplots(figsize=(6, 5), layout="constrained")
+    for kind, color in KINDS.items():
+        places = np.array([[row["x"], row["y"]] for row in rows if row["kind"] == kind], float)
+        axes.scatter(*places.T, s=4, color=color, label=kind)
+    axes.set(title="Relations of LRN on PushingCube, N = 3 to 6", xticks=[], yticks=[])
+    axes.legend(markerscale=3)
+    save(figure, folder, "figure7.png")
+
+
+def figure_8(folder):
+    """Figure 8: mean norm of LRN's relations by kind over an episode, at N = 4 and 5."""
+    plt = pyplot()
+    rows = read_text("figure8.csv")
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained", sharey=True)
+    for N, panel in zip((4, 5), axes):
+        of_n = [row for row in rows if row["distractors"] == str(N)]
+        seconds = [int(row["step"]) / 25 for row in of_n]
+        for kind, color in KINDS.items():
+            panel.plot(seconds, [float(row[kind]) for row in of_n], color=color, label=kind)
+        panel.set(title=f"{N} distractors", xlabel="seconds", ylim=(0, None))
+    axes[0].set(ylabel="mean norm of a relation")
+    axes[0].legend()
+    save(figure, folder, "figure8.png")
+
+
+def read_text(name):
+    """Rows (dicts of text) of a CSV in this folder."""
+    with open(os.path.join(HERE, name), newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def save(figure, folder, name):
     path = os.path.join(folder, name)
     figure.savefig(path, dpi=150)
     print(f"wrote {path}")
 
 
-FIGURES = {"3": figure_3}                # number in the paper -> function
+FIGURES = {"3": figure_3, "7": figure_7, "8": figure_8}        # number in the paper -> function
 
 
 def main():

@@ -7,7 +7,7 @@ Prints one row per band of goal heights: the score at the end (axis-aligned and 
 score on the way, and the shares of episodes that came to each phase at some moment:
 reached: all three fingertips within 6 cm of the target cube's centre; raised: that centre higher
 than 5.5 cm (0.0325 on the floor); above: within 2 cm of the goal, seen from above; placed: overlap
-of 0.8; kept: overlap of 0.8 at the end. Episodes and noise are those of evaluate.py.
+of 0.8; kept: overlap of 0.8 at the end. Episodes and (mean) actions are those of evaluate.py.
 """
 import argparse
 import math
@@ -64,7 +64,7 @@ def watch(run, distractors, episodes):
         seeds = [evaluate.episode_seed(first + e) for e in range(count)]
         envs, observations, _ = evaluate.start(checkpoint, agent, distractors, seeds)
         watched = [Watched(env) for env in envs]
-        evaluate.to_the_end(agent, watched, observations, seeds, mean_actions=False)
+        evaluate.to_the_end(agent, watched, observations, seeds, sample_actions=False)
         for env in watched:
             heights.append(env.height)
             rows.append([env.row[name] for name in COLUMNS])

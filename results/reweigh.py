@@ -76,7 +76,7 @@ def play(run, N, episodes, loader):
     """A row of zeroshot.csv of the agent that `loader` makes of the run."""
     evaluate.load = loader               # evaluate.play() loads by itself: hand it our loader
     evaluate.trained_z.cache_clear()     # z of the other agent
-    return evaluate.summary(N, evaluate.play(run, N, 0, episodes, mean_actions=False))
+    return evaluate.summary(N, evaluate.play(run, N, 0, episodes, sample_actions=False))
 
 
 @torch.inference_mode()

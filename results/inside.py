@@ -1,0 +1,183 @@
+"""Look inside trained agents: the numbers behind figures 6, 7 and 8 (the paper's appendix).
+
+    python results/inside.py                    all that the shipped runs allow
+    python results/inside.py 8 --episodes 20    one of them, from fewer episodes
+
+Plays episodes with the shipped runs push-{lrn,rn,attn}-n2-seed0 and writes beside this file
+
+    figure6.csv         z at each N, embedded in the plane by t-SNE: encoder, distractors, x, y
+    figure6-drift.csv   how far the z at each N are from those at 2: encoder, distractors, distance
+    figure7.csv         LRN's relations at N = 3..6, embedded in the plane: kind, x, y
+    figure8.csv         LRN's relations at N = 4 and 5: mean norm by kind and step
+
+t-SNE needs scikit-learn. Episodes and actions are those of evaluate.py.
+"""
+import argparse
+import csv
+import os
+import sys
+
+import numpy as np
+import torch
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+sys.path.insert(0, os.path.dirname(HERE))
+import evaluate  # noqa: E402
+from train import fail, load  # noqa: E402
+from trifinger_env import IDENTIFIER  # noqa: E402
+
+KINDS = ("finger 0", "finger 1", "finger 2", "target", "distractors")
+LOOKS = 5                                # moments of an episode that t-SNE gets to see
+POINTS = 5000                            # most points that t-SNE and distances are given
+CHUNK = 25                               # episodes side by side
+
+
+# ---- playing
+
+@torch.inference_mode()
+def watch(run, distractors, episodes, look):
+    """look(agent, obs) -> (B, ...) after every step of every episode: (steps, E, ...)."""
+    checkpoint, agent = load(run)
+    seen = []
+    for first in range(0, episodes, CHUNK):
+        seeds = [evaluate.episode_seed(e) for e in range(first, min(first + CHUNK, episodes))]
+        envs, observations, _ = evaluate.start(checkpoint, agent, distractors, seeds)
+        noise = [np.random.default_rng(seed) for seed in seeds]
+        steps = []
+        for _ in range(checkpoint["settings"]["episode_steps"]):
+            actions = evaluate.actions(agent, observations, noise, sample_actions=False)
+            observations = [env.step(action)[0] for env, action in zip(envs, actions)]
+            steps.append(look(agent, evaluate.as_batch(observations)).numpy())
+        seen.append(np.stack(steps))
+        for env in envs:
+            env.close()
+    return np.concatenate(seen, axis=1)
+
+
+def z_of(agent, obs):
+    """z (B, Z)."""
+    return agent.encode(obs)
+
+
+def relations_of(agent, obs):
+    """LRN's relations, fingers first, then the target, then distractors: (B, K, D)."""
+    objects, goal = agent.tokens(obs)
+    r = agent.encoder.relations(objects, goal)                 # (B, K, D), cubes first
+    is_target = obs["cubes"][..., IDENTIFIER] == obs["goal"][:, None, IDENTIFIER]
+    count = is_target.shape[1]
+    fingers, target = r[:, count:], r[:, :count][is_target]
+    others = r[:, :count][~is_target].view(len(r), count - 1, -1)
+    return torch.cat([fingers, target[:, None], others], dim=1)
+
+
+# ---- measures
+
+def energy_distance(a, b):
+    """Distance of two clouds of points (n, Z), (m, Z), in units of the distances within b.
+
+    (2 E|a - b| - E|a - a'| - E|b - b'|) / E|b - b'| (Szekely, 2003): 0 for equal distributions.
+    """
+    a, b = torch.from_numpy(a), torch.from_numpy(b)
+    within = torch.cdist(b, b).mean()
+    return ((2 * torch.cdist(a, b).mean() - torch.cdist(a, a).mean() - within) / within).item()
+
+
+def some(points, count, seed=0):
+    """At most `count` rows, drawn without repetition."""
+    rows = np.random.default_rng(seed).permutation(len(points))[:count]
+    return points[rows]
+
+
+def plane(points):
+    """(n, 2): t-SNE of points (n, Z)."""
+    try:
+        from sklearn.manifold import TSNE
+    except ImportError:
+        raise ValueError("figures 6 and 7 need scikit-learn: pip install scikit-learn") from None
+    return TSNE(random_state=0).fit_transform(points)
+
+
+def moments(steps):
+    """LOOKS moments, evenly over an episode: (steps, E, ...) -> (LOOKS * E, ...)."""
+    at = np.linspace(0, len(steps) - 1, LOOKS).astype(int)
+    return steps[at].reshape(-1, *steps.shape[2:])
+
+
+# ---- the figures' numbers
+
+def figure_6(episodes):
+    """z by N, encoder by encoder."""
+    dots, drifts = [], []
+    for encoder in ("attn", "rn", "lrn"):
+        run = os.path.join(HERE, f"push-{encoder}-n2-seed0")
+        if not os.path.exists(run):
+            print(f"figure 6 without {encoder}: {run} is not there")
+            continue
+        numbers = range(10)
+        steps = {N: watch(run, N, episodes, z_of) for N in numbers}
+        whole = {N: some(z.reshape(-1, z.shape[-1]), POINTS) for N, z in steps.items()}
+        drifts += [(encoder, N, f"{energy_distance(whole[N], whole[2]):.4f}") for N in numbers]
+        looks = {N: some(moments(z), POINTS // 10) for N, z in steps.items()}
+        places = plane(np.concatenate(list(looks.values())))
+        labels = [N for N in numbers for _ in looks[N]]
+        dots += [(encoder, N, f"{x:.2f}", f"{y:.2f}") for N, (x, y) in zip(labels, places)]
+    write("figure6.csv", ("encoder", "distractors", "x", "y"), dots)
+    write("figure6-drift.csv", ("encoder", "distractors", "distance"), drifts)
+
+
+def figure_7(episodes):
+    """LRN's relations by kind, in the plane."""
+    run = os.path.join(HERE, "push-lrn-n2-seed0")
+    rows, kinds = [], []
+    for N in range(3, 7):
+        r = moments(watch(run, N, episodes, relations_of))     # (n, K, D)
+        r = some(r, POINTS // (4 * r.shape[1]))
+        rows += list(r.reshape(-1, r.shape[-1]))
+        kinds += [KINDS[min(i, 4)] for i in range(r.shape[1])] * len(r)
+    places = plane(np.array(rows))
+    write("figure7.csv", ("kind", "x", "y"),
+          [(kind, f"{x:.2f}", f"{y:.2f}") for kind, (x, y) in zip(kinds, places)])
+
+
+def figure_8(episodes):
+    """Norms of LRN's relations by kind over an episode; of distractors, the mean of their norms."""
+    run = os.path.join(HERE, "push-lrn-n2-seed0")
+    rows = []
+    for N in (4, 5):
+        norms = np.linalg.norm(watch(run, N, episodes, relations_of), axis=-1)   # (steps, E, K)
+        means = norms.mean(axis=1)                                               # (steps, K)
+        for step, row in enumerate(means, 1):
+            values = [*row[:4], row[4:].mean()]
+            rows.append((N, step, *(f"{value:.3f}" for value in values)))
+    write("figure8.csv", ("distractors", "step", *KINDS), rows)
+
+
+def write(name, columns, rows):
+    path = os.path.join(HERE, name)
+    with open(path, "w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([columns, *rows])
+    print(f"wrote {path}")
+
+
+FIGURES = {"6": figure_6, "7": figure_7, "8": figure_8}
+
+
+def main():
+    parser = argparse.ArgumentParser(description="Numbers behind figures 6, 7 and 8.")
+    parser.error = fail
+    parser.add_argument("figures", nargs="*", help=f"of {', '.join(FIGURES)} (default: all)")
+    parser.add_argument("--episodes", type=int, default=200, metavar="E", help="default 200")
+    args = parser.parse_args()
+    for figure in args.figures:
+        if figure not in FIGURES:
+            fail(f"there is no figure {figure} here; there are {', '.join(FIGURES)}")
+    torch.set_num_threads(1)
+    try:
+        for figure in args.figures or FIGURES:
+            FIGURES[figure](args.episodes)
+    except (ValueError, OSError) as error:
+        fail(str(error))
+
+
+if __name__ == "__main__":
+    main()
