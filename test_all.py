@@ -3199,6 +3199,53 @@ def test_a_shipped_run_has_the_same_weights_and_no_optimiser(trained, tmp_path, 
                                                         "timing.csv"]
 
 
+def test_every_shipped_run_has_its_command():
+    """reproduce.sh names each run as train.py does, and knows which are done."""
+    done = subprocess.run(["bash", "results/reproduce.sh", "--list"], cwd=HERE,
+                          capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    rows = [line.split() for line in done.stdout.splitlines()]
+    names = [name for name, *_ in rows]
+    assert len(set(names)) == len(names) >= 12
+    for name, *words in rows:
+        arguments = words[words.index("--encoder"):]
+        assert train.read_command(arguments).out == os.path.join("runs", name)
+        is_shipped = os.path.exists(os.path.join(HERE, "results", name, "zeroshot.csv"))
+        assert (words[0] == "done") == is_shipped, name
+    shipped = [name for name in os.listdir(os.path.join(HERE, "results")) if "-seed" in name]
+    assert shipped and set(shipped) <= set(names)
+
+
+def test_relations_are_told_apart_by_kind(results_scripts):
+    """Fingers, target, distractors, whichever cube the target is."""
+    import inside
+
+    torch.manual_seed(0)
+    agent = train.Agent("lrn", 3, train.DEFAULTS)
+    env = train.make_env("push", 3, train.DEFAULTS)
+    observations, targets = [], []
+    for seed in range(6):
+        observations.append(env.reset(seed=seed)[0])
+        targets.append(env.target)
+    env.close()
+    assert len(set(targets)) > 1
+    obs = evaluate.as_batch(observations)
+    found = inside.relations_of(agent, obs)
+    relations = agent.encoder.relations(*agent.tokens(obs))    # cubes, then fingers
+    for b, target in enumerate(targets):
+        others = [i for i in range(4) if i != target]
+        assert torch.equal(found[b], relations[b, [4, 5, 6, target, *others]])
+
+
+def test_energy_distance_of_a_point_and_of_equal_clouds(results_scripts):
+    import inside
+
+    # b is {0, 1}: E|a - b| = 1/2, E|b - b'| = 1/2, so (1 - 0 - 1/2) / (1/2)
+    assert inside.energy_distance(np.zeros((1, 1)), np.array([[0.0], [1.0]])) == pytest.approx(1)
+    cloud = np.random.default_rng(0).normal(size=(50, 3))
+    assert inside.energy_distance(cloud, cloud[::-1].copy()) == pytest.approx(0, abs=1e-6)
+
+
 # ---------------------------------------------------------------- every module
 
 @pytest.mark.parametrize("name", ["lrn.py", "rn.py", "attn.py", "ppo.py", "trifinger_env.py"])
