@@ -86,8 +86,9 @@ class PPO(nn.Module):
                            ValueError if it does not divide
     lam                    GAE's lambda
     entropy, value_coef    coefficients of the loss
-    anneal_lr, anneal_clip     multiply the learning rate, the clip range by the share of training
-                               that is left
+    lr_power               the learning rate falls as lr x (share of training left) ^ lr_power:
+                           1 in a line, 0 not at all
+    anneal_clip            multiply the clip range by the share of training left
     normalize_advantages   to mean 0 and standard deviation 1 over the whole batch of all ranks
     normalize_values       the value network learns (return - running mean) / running std
     auxiliary              weight of `agent.auxiliary(obs)`, an extra loss on each minibatch;
@@ -99,7 +100,7 @@ class PPO(nn.Module):
 
     def __init__(self, agent, envs, *, steps=250, epochs=5, minibatches=8, lr=1e-3, adam_eps=1e-5,
                  clip=0.2, discount=0.98, lam=0.95, entropy=0.001, value_coef=0.5,
-                 max_grad_norm=0.5, anneal_lr=True, anneal_clip=False, normalize_advantages=True,
+                 max_grad_norm=0.5, lr_power=1.0, anneal_clip=False, normalize_advantages=True,
                  normalize_values=True, auxiliary=0.0):
         super().__init__()
         if (steps * len(envs)) % minibatches:
@@ -107,7 +108,7 @@ class PPO(nn.Module):
                              f"into {minibatches} minibatches")
         self.agent, self.envs = agent, envs
         self.steps, self.epochs, self.minibatches = steps, epochs, minibatches
-        self.lr, self.anneal_lr = lr, anneal_lr
+        self.lr, self.lr_power = lr, lr_power
         self.clip, self.anneal_clip = clip, anneal_clip
         self.discount, self.lam = discount, lam
         self.entropy_coef, self.value_coef, self.auxiliary_coef = entropy, value_coef, auxiliary
@@ -231,7 +232,7 @@ class PPO(nn.Module):
         Returns the mean diagnostics. FloatingPointError if a gradient is not finite; the weights
         are then as before that step.
         """
-        lr = self.lr * left if self.anneal_lr else self.lr
+        lr = self.lr * left ** self.lr_power
         clip = self.clip * left if self.anneal_clip else self.clip
         for group in self.optimizer.param_groups:
             group["lr"] = lr

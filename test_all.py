@@ -1696,10 +1696,10 @@ def test_the_rows_of_a_part_belong_together():
     assert learner.update(1.0)["fine"] == 1
 
 
-@pytest.mark.parametrize("anneal", [True, False])
-def test_learning_rate_and_clip_range_shrink_with_the_training_that_is_left(anneal):
+@pytest.mark.parametrize("power, anneal", [(0, False), (1, True), (2, True)])
+def test_learning_rate_and_clip_range_shrink_with_the_training_that_is_left(power, anneal):
     learner = PPO(TinyAgent(), [Counter(True)], steps=8, minibatches=1, epochs=1, lr=1e-3,
-                  clip=0.2, anneal_lr=anneal, anneal_clip=anneal)
+                  clip=0.2, lr_power=power, anneal_clip=anneal)
     learner.rollout([0])
     clips, loss = [], learner.loss
 
@@ -1708,15 +1708,15 @@ def test_learning_rate_and_clip_range_shrink_with_the_training_that_is_left(anne
         return loss(obs, clip=clip, **part)
 
     learner.loss = watched
-    share = 0.25 if anneal else 1.0
-    assert learner.update(0.25)["lr"] == pytest.approx(1e-3 * share)
-    assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 * share)
-    assert clips == [pytest.approx(0.2 * share)]
+    lr = {0: 1e-3, 1: 0.25e-3, 2: 0.0625e-3}[power]            # at a quarter left
+    assert learner.update(0.25)["lr"] == pytest.approx(lr)
+    assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(lr)
+    assert clips == [pytest.approx(0.05 if anneal else 0.2)]
 
 
 def test_clip_range_stays_by_default_while_the_learning_rate_shrinks():
     learner = PPO(TinyAgent(), [None], minibatches=1)
-    assert learner.anneal_lr and not learner.anneal_clip
+    assert learner.lr_power == 1 and not learner.anneal_clip
 
 
 def test_an_auxiliary_loss_without_weight_is_never_asked_for():
@@ -2048,7 +2048,7 @@ def arguments(**changes):
 def test_every_setting_reaches_the_learner_and_its_environments():
     """Each setting with a value of its own."""
     of_ppo = {"steps": 7, "epochs": 2, "minibatches": 3, "lr": 0.1, "clip": 0.3, "discount": 0.4,
-              "lam": 0.5, "value_coef": 0.7, "max_grad_norm": 0.8, "anneal_lr": False,
+              "lam": 0.5, "value_coef": 0.7, "max_grad_norm": 0.8, "lr_power": 0.6,
               "anneal_clip": True, "normalize_advantages": False, "normalize_values": False}
     of_env = {"episode_steps": 11, "substeps": 2, "timestep": 0.002, "action_mode": "absolute",
               "action_scale": 0.07, "cube_mass": 0.03, "finger_friction": 0.6, "goal_yaw": 0.12}
@@ -2093,7 +2093,7 @@ def test_paper_sets_the_numbers_that_the_paper_prints(tmp_path):
     """A.1 and A.2 by hand, and the 2500 steps of 30 s; --set comes on top."""
     printed = {"discount": 0.98, "entropy": 0.01, "lr": 0.00025, "value_coef": 0.5,
                "max_grad_norm": 0.5, "minibatches": 40, "lam": 0.95, "clip": 0.5, "epochs": 4,
-               "anneal_lr": True, "reward_overlap": 100, "reward_distance": 250,
+               "lr_power": 1, "reward_overlap": 100, "reward_distance": 250,
                "reward_curiosity": 10, "reward_reach": 0, "auxiliary": 0, "z_dim": 25,
                "episode_steps": 2500, "relations": True, "layer_norm": True}
     out = str(tmp_path / "run")
@@ -2102,8 +2102,8 @@ def test_paper_sets_the_numbers_that_the_paper_prints(tmp_path):
     assert settings["substeps"] * settings["timestep"] == pytest.approx(30 / 2500)
     _, settings = train.parse(["--paper", "--out", out, "--set", "z_dim=50", "lr=0.1"])
     assert settings["z_dim"] == 50 and settings["lr"] == 0.1 and settings["clip"] == 0.5
-    _, settings = train.parse(["--out", out, "--frames", "77", "--set", "anneal_lr=False"])
-    assert settings == {**train.DEFAULTS, "frames": 77, "anneal_lr": False}
+    _, settings = train.parse(["--out", out, "--frames", "77", "--set", "lr_power=1"])
+    assert settings == {**train.DEFAULTS, "frames": 77, "lr_power": 1.0}
 
 
 def test_lifting_has_frames_of_its_own(tmp_path):
@@ -2194,7 +2194,7 @@ def test_progress_tells_of_every_update(trained):
     assert [row["frames"] for row in rows] == [400 * row["update"] for row in rows]
     for row in rows:
         left = 1 - (row["update"] - 1) / 40
-        assert row["lr"] == pytest.approx(0.002 * left, rel=1e-5)
+        assert row["lr"] == pytest.approx(0.002 * left ** 2, rel=1e-5)
         assert row["episodes"] == 8 and row["length"] <= 50
     _, agent = train.load(trained)
     assert rows[-1]["std"] == pytest.approx(agent.log_std.exp().mean().item(), rel=1e-4)
@@ -3373,7 +3373,7 @@ MUTATIONS = {
         ("if self.auxiliary_coef:", "if True:",
          "test_an_auxiliary_loss_without_weight_is_never_asked_for"),
         # The step
-        ("lr = self.lr * left if self.anneal_lr else self.lr", "lr = self.lr",
+        ("left ** self.lr_power", "left",
          "test_learning_rate_and_clip_range_shrink_with_the_training_that_is_left"),
         ("clip = self.clip * left if self.anneal_clip else self.clip", "clip = self.clip",
          "test_learning_rate_and_clip_range_shrink_with_the_training_that_is_left"),
@@ -3615,7 +3615,7 @@ MUTATIONS = {
          "test_every_setting_reaches_the_learner_and_its_environments"),
         ("\"cube_mass\", \"finger_friction\", \"goal_yaw\")", "\"cube_mass\", \"goal_yaw\")",
          "test_every_setting_reaches_the_learner_and_its_environments"),
-        ("\"anneal_lr\", \"anneal_clip\",\n", "\"anneal_lr\",\n",
+        ("\"lr_power\", \"anneal_clip\",\n", "\"lr_power\",\n",
          "test_every_setting_reaches_the_learner_and_its_environments"),
         ("reward_weights=weights", "reward_weights=None",
          "test_every_setting_reaches_the_learner_and_its_environments"),
