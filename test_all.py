@@ -2108,7 +2108,7 @@ def test_paper_sets_the_numbers_that_the_paper_prints(tmp_path):
 
 def test_lifting_has_frames_of_its_own(tmp_path):
     out = str(tmp_path / "run")
-    for words, frames in (("", 3_000_000), ("--task lift", 8_000_000), ("--paper", 60_000_000),
+    for words, frames in (("", 3_000_000), ("--task lift", 6_000_000), ("--paper", 60_000_000),
                           ("--task lift --paper", 60_000_000), ("--task lift --frames 9", 9),
                           ("--task lift --set frames=7", 7)):
         _, settings = train.parse(["--out", out, *words.split()])
