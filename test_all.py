@@ -2106,8 +2106,12 @@ def test_paper_sets_the_numbers_that_the_paper_prints(tmp_path):
     assert settings == {**train.DEFAULTS, "frames": 77, "lr_power": 1.0}
 
 
-def test_lifting_has_frames_of_its_own(tmp_path):
+def test_lifting_has_frames_and_a_schedule_of_its_own(tmp_path):
     out = str(tmp_path / "run")
+    for words, power in (("", 1), ("--task lift", 2), ("--task lift --paper", 1),
+                         ("--task lift --set lr_power=3", 3)):
+        _, settings = train.parse(["--out", out, *words.split()])
+        assert settings["lr_power"] == power, words
     for words, frames in (("", 3_000_000), ("--task lift", 6_000_000), ("--paper", 60_000_000),
                           ("--task lift --paper", 60_000_000), ("--task lift --frames 9", 9),
                           ("--task lift --set frames=7", 7)):
@@ -2194,7 +2198,7 @@ def test_progress_tells_of_every_update(trained):
     assert [row["frames"] for row in rows] == [400 * row["update"] for row in rows]
     for row in rows:
         left = 1 - (row["update"] - 1) / 40
-        assert row["lr"] == pytest.approx(0.002 * left ** 2, rel=1e-5)
+        assert row["lr"] == pytest.approx(0.002 * left, rel=1e-5)
         assert row["episodes"] == 8 and row["length"] <= 50
     _, agent = train.load(trained)
     assert rows[-1]["std"] == pytest.approx(agent.log_std.exp().mean().item(), rel=1e-4)
@@ -3622,7 +3626,7 @@ MUTATIONS = {
         ("setting.paper if args.paper else setting.default", "setting.default",
          "test_paper_sets_the_numbers_that_the_paper_prints"),
         ("if args.task == \"lift\" and not args.paper:", "if args.task == \"lift\":",
-         "test_lifting_has_frames_of_its_own"),
+         "test_lifting_has_frames_and_a_schedule_of_its_own"),
         ("Setting(0.2, 0.5, \"A.2\")", "Setting(0.2, 0.2, \"A.2\")",
          "test_paper_sets_the_numbers_that_the_paper_prints"),
         ("        refuse_if_without_effect(name, args.encoder)\n", "",
