@@ -1,6 +1,6 @@
 """How far do lifting episodes come, by height of the goal?
 
-    python results/phases.py results/lift-longest                         200 episodes at N = 2
+    python results/phases.py results/lift-lrn-n2-seed0                    200 episodes at N = 2
     python results/phases.py RUN [RUN ...] --distractors 9 --episodes 100
 
 Prints one row per band of goal heights: the score at the end (axis-aligned and strict), the best
