@@ -3164,7 +3164,7 @@ def test_figures_are_drawn_and_tables_printed(tmp_path):
     done = run("results/figures.py", "table")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("| push-lrn-n2 | ") == 3       # one row in each of three tables
-    done = run("results/figures.py", "8")
+    done = run("results/figures.py", "9")
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (optional)")
     done = run("results/figures.py", "3", "--out", str(tmp_path))

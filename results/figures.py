@@ -234,7 +234,7 @@ def figure_8(folder):
     rows = read_text("figure8.csv")
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained", sharey=True)
     for N, panel in zip((4, 5), axes):
-        of_n = [row for row in rows if row["distractors"] == str(N)]
+        of_n = [row for row in rows if row["N"] == str(N)]
         seconds = [int(row["step"]) / 25 for row in of_n]
         for kind, color in KINDS.items():
             panel.plot(seconds, [float(row[kind]) for row in of_n], color=color, label=kind)

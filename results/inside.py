@@ -149,7 +149,7 @@ def figure_8(episodes):
         for step, row in enumerate(means, 1):
             values = [*row[:4], row[4:].mean()]
             rows.append((N, step, *(f"{value:.3f}" for value in values)))
-    write("figure8.csv", ("distractors", "step", *KINDS), rows)
+    write("figure8.csv", ("N", "step", *KINDS), rows)
 
 
 def write(name, columns, rows):
