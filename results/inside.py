@@ -29,7 +29,6 @@ from trifinger_env import IDENTIFIER  # noqa: E402
 KINDS = ("finger 0", "finger 1", "finger 2", "target", "distractors")
 LOOKS = 5                                # moments of an episode that t-SNE gets to see
 POINTS = 5000                            # most points that t-SNE and distances are given
-CHUNK = 25                               # episodes side by side
 
 
 # ---- playing
@@ -39,8 +38,9 @@ def watch(run, distractors, episodes, look):
     """look(agent, obs) -> (B, ...) after every step of every episode: (steps, E, ...)."""
     checkpoint, agent = load(run)
     seen = []
-    for first in range(0, episodes, CHUNK):
-        seeds = [evaluate.episode_seed(e) for e in range(first, min(first + CHUNK, episodes))]
+    for first in range(0, episodes, evaluate.CHUNK):
+        last = min(first + evaluate.CHUNK, episodes)
+        seeds = [evaluate.episode_seed(e) for e in range(first, last)]
         envs, observations, _ = evaluate.start(checkpoint, agent, distractors, seeds)
         noise = [np.random.default_rng(seed) for seed in seeds]
         steps = []
