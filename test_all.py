@@ -3160,6 +3160,19 @@ def test_table_puts_seeds_together(tmp_path, results_scripts):
     assert abs(cell.bar - 0.03 / 3 ** 0.5) < 1e-12             # mean of three means, each +- 0.03
 
 
+def test_frames_to_a_threshold_are_those_of_a_mean_over_25_updates(tmp_path, results_scripts):
+    """Success 0 for 100 updates, then 1: a mean of 25 passes 0.5 with the 13th of the latter."""
+    import figures
+
+    for name, rows in (("whole", range(1, 201)), ("never", range(1, 101))):
+        lines = [f"{u},{4000 * u},{float(u > 100)}" for u in rows]
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "progress.csv").write_text(
+            "\n".join(["update,frames,success_aabb", *lines]) + "\n")
+    found = figures.frames_to([str(tmp_path / "whole"), str(tmp_path / "never")], 0.5)
+    np.testing.assert_allclose(found, [4000 * 113 / 1e6, np.nan])
+
+
 def test_figures_are_drawn_and_tables_printed(tmp_path):
     done = run("results/figures.py", "table")
     assert done.returncode == 0, done.stderr
@@ -3167,9 +3180,11 @@ def test_figures_are_drawn_and_tables_printed(tmp_path):
     done = run("results/figures.py", "9")
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (optional)")
-    done = run("results/figures.py", "3", "--out", str(tmp_path))
+    numbers = ("1", "3", "4", "5")
+    done = run("results/figures.py", *numbers, "--out", str(tmp_path))
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "figure3.png").read_bytes().startswith(b"\x89PNG")
+    for number in numbers:
+        assert (tmp_path / f"figure{number}.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_shipped_curves_stand_for_windows_of_updates(results_scripts, monkeypatch):
@@ -3210,10 +3225,15 @@ def test_every_shipped_run_has_its_command():
     assert done.returncode == 0, done.stderr
     rows = [line.split() for line in done.stdout.splitlines()]
     names = [name for name, *_ in rows]
-    assert len(set(names)) == len(names) >= 12
+    assert len(set(names)) == len(names) >= 80
     for name, *words in rows:
-        arguments = words[words.index("--encoder"):]
-        assert train.read_command(arguments).out == os.path.join("runs", name)
+        arguments = words[words.index("--task"):]
+        plain, seed = train.read_command(arguments).out.rsplit("-", 1)
+        assert name.endswith(f"-{seed}")
+        if "--set" in arguments:                               # a word says what is different
+            assert os.path.join("runs", name).startswith(f"{plain}-")
+        else:
+            assert os.path.join("runs", name) == f"{plain}-{seed}"
         is_shipped = os.path.exists(os.path.join(HERE, "results", name, "zeroshot.csv"))
         assert (words[0] == "done") == is_shipped, name
     shipped = [name for name in os.listdir(os.path.join(HERE, "results")) if "-seed" in name]

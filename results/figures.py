@@ -26,10 +26,35 @@ MEASURES = {                             # column of zeroshot.csv -> title of it
 # Student's t for a 95 % interval, by the number of seeds
 STUDENT = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776}
 TASKS = {"push": "PushingCube", "lift": "LiftingCube"}
-LINES = {                                # of figure 3: encoder -> label, colour
+LINES = {                                # of figures 3, 4 and 6: encoder -> label, colour
     "lrn": ("LRN", "#0072B2"),
     "rn": ("RN", "#009E73"),
     "attn": ("ATTN", "#CC3311"),
+    "lrn-max": ("LRN-max", "#AA8800"),
+}
+FOUR = ("#0072B2", "#CC3311", "#009E73", "#AA8800")            # colours of at most four lines
+ABLATIONS = {                            # panels of figure 5: title -> {group of runs: label}
+    "Relations, LayerNorm": {
+        "push-lrn-n2": "LRN",
+        "push-lrn-n2-norelations": "without relations",
+        "push-lrn-n2-mean": "mean, no LayerNorm",
+    },
+    "Width of z": {
+        "push-lrn-n2": "25",
+        "push-lrn-n2-z10": "10",
+        "push-lrn-n2-z50": "50",
+        "push-lrn-n2-z100": "100",
+    },
+    "Reward: one term left out": {
+        "push-lrn-n2": "all terms",
+        "push-lrn-n2-nooverlap": "no overlap",
+        "push-lrn-n2-nodistance": "no distance",
+        "push-lrn-n2-noreach": "no reach",
+    },
+    "Reward: curiosity": {
+        "push-lrn-n2": "without",
+        "push-lrn-n2-curiosity": "with, weight 10",
+    },
 }
 KINDS = {                                # of relations -> colour, those of the paper's figure 7
     "finger 0": "black",
@@ -62,8 +87,8 @@ def read(run, name):
 
 def shipped_runs():
     """Run folders in this folder: task by task, encoder by encoder, seed by seed."""
-    return [run for task in TASKS for encoder in LINES
-            for run in sorted(glob.glob(f"{HERE}/{task}-{encoder}-n*-seed?"))]
+    return [run for task in TASKS for encoder in (*LINES, "mlp")
+            for run in sorted(glob.glob(f"{HERE}/{task}-{encoder}-n[0-9]*-seed?"))]
 
 
 def by_seed(runs):
@@ -172,10 +197,10 @@ def pyplot():
     return pyplot
 
 
-def smooth(rows, name):
-    """Frames in millions and the means of a column over WINDOW updates; a row may stand for several
-    updates (ship.py)."""
-    count = max(round(WINDOW * len(rows["update"]) / rows["update"][-1]), 1)
+def smooth(rows, name, window=WINDOW):
+    """Frames in millions and the means of a column over `window` updates; a row may stand for
+    several updates (ship.py)."""
+    count = max(round(window * len(rows["update"]) / rows["update"][-1]), 1)
     means = np.convolve(rows[name], np.ones(count) / count, "valid")
     return rows["frames"][count - 1:] / 1e6, means
 
@@ -187,32 +212,128 @@ def draw(axes, x, curves, label, color, marker=None):
     axes.fill_between(x, lowest, highest, color=color, alpha=0.15, linewidth=0)
 
 
+def draw_zero_shot(axes, runs, label, color):
+    """Scores of runs of several seeds at every N."""
+    cells = over_seeds(runs, "success_aabb")
+    values = np.array([cells[n].values for n in cells]).T      # (S, numbers)
+    draw(axes, list(cells), values, label, color, marker="o")
+
+
+def with_seeds(label, runs):
+    """A label that says how many runs stand behind the line."""
+    return f"{label}, {len(runs)} seed{'s' if len(runs) > 1 else ''}"
+
+
+def draw_groups(axes, groups, lines):
+    """Zero-shot curves of some groups of runs, {group: label}; one without runs is said so."""
+    for (group, label), color in zip(lines.items(), FOUR):
+        if group in groups:
+            draw_zero_shot(axes, groups[group], with_seeds(label, groups[group]), color)
+        else:
+            axes.plot([], [], color=color, label=f"{label} (not run)")
+    axes.set(xlabel="N, distractors at test time", xlim=(-0.4, 9.4), ylim=(0, 1), xticks=range(10))
+    axes.legend(loc="lower left", fontsize=8)
+
+
+def frames_to(runs, threshold):
+    """Million frames until training success (mean of 25 updates) reaches a threshold, run by run:
+    NaN if it never does."""
+    found = []
+    for run in runs:
+        frames, success = smooth(read(run, "progress.csv"), "success_aabb", window=25)
+        reached = np.flatnonzero(success >= threshold)
+        found.append(frames[reached[0]] if len(reached) else np.nan)
+    return np.array(found)
+
+
+def figure_1(folder):
+    """Figure 1, right: frames until training success is 0.5 and 0.8, by the N of training."""
+    plt = pyplot()
+    groups = by_seed(shipped_runs())
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained", sharey=True)
+    for threshold, panel in zip((0.5, 0.8), axes):
+        for encoder, label, color in (("mlp", "MLP", FOUR[1]), ("lrn", "LRN", FOUR[0])):
+            for N in range(4):
+                frames = frames_to(groups.get(f"push-{encoder}-n{N}", []), threshold)
+                panel.plot([N] * len(frames), frames, "o", color=color, alpha=0.7,
+                           label=label if N == 0 else None)
+                if np.isnan(frames).any():
+                    panel.annotate(f"{label}: never", (N, 1), (0, -14), color=color, ha="center",
+                                   xycoords=("data", "axes fraction"), textcoords="offset points")
+        panel.set(title=f"PushingCube: frames to reach {threshold}", xlabel="N in training",
+                  xticks=range(4), xlim=(-0.5, 3.5))
+    axes[0].set(ylabel="million frames, each run a dot", ylim=(0, None))
+    axes[0].legend(loc="lower right")
+    save(figure, folder, "figure1.png")
+
+
 def figure_3(folder):
     """Figure 3: training at 2 distractors (left), zero-shot at others (right); a row for a task."""
     plt = pyplot()
     groups = by_seed(shipped_runs())
-    tasks = [task for task in TASKS if f"{task}-lrn-n2" in groups]
-    figure, axes = plt.subplots(len(tasks), 2, figsize=(9, 4 * len(tasks)), layout="constrained",
-                                squeeze=False)
-    for task, (left, right) in zip(tasks, axes):
+    figure, axes = plt.subplots(2, 2, figsize=(9, 8), layout="constrained")
+    for task, (left, right) in zip(TASKS, axes):
         for encoder, (label, color) in LINES.items():
             runs = groups.get(f"{task}-{encoder}-n2")
             if not runs:
                 continue
-            label += f", {len(runs)} seeds" if len(runs) > 1 else ", 1 seed"
-            progress = [read(run, "progress.csv") for run in runs]
-            frames, _ = smooth(progress[0], "success_aabb")
-            curves = [smooth(rows, "success_aabb")[1] for rows in progress]
-            draw(left, frames, curves, label, color)
-            cells = over_seeds(runs, "success_aabb")
-            values = np.array([cells[n].values for n in cells]).T          # (S, numbers)
-            draw(right, list(cells), values, label, color, marker="o")
+            progress = [smooth(read(run, "progress.csv"), "success_aabb") for run in runs]
+            curves = [success for _, success in progress]
+            draw(left, progress[0][0], curves, with_seeds(label, runs), color)
+            draw_zero_shot(right, runs, label, color)
         left.set(title=f"{TASKS[task]}: training at N = 2", xlabel="million frames",
                  ylabel="fractional success (axis-aligned)", ylim=(0, 1))
         right.set(title=f"{TASKS[task]}: zero-shot", xlabel="N, distractors at test time",
                   ylim=(0, 1), xticks=[0, 2, 5, 9, 14, 19])
         left.legend(loc="lower right")
     save(figure, folder, "figure3.png")
+
+
+def figure_4(folder):
+    """Figure 4: zero-shot scores of agents trained at 0, 1, 2 and 3 distractors."""
+    plt = pyplot()
+    groups = by_seed(shipped_runs())
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3.5), layout="constrained", sharey=True)
+    for encoder, panel in zip(("attn", "rn", "lrn"), axes):
+        draw_groups(panel, groups, {f"push-{encoder}-n{N}": f"trained at {N}" for N in range(4)})
+        panel.set(title=LINES[encoder][0])
+    axes[0].set(ylabel="fractional success (axis-aligned)")
+    save(figure, folder, "figure4.png")
+
+
+def figure_5(folder):
+    """Figure 5: zero-shot scores of LRN with parts of it, and of the reward, changed."""
+    plt = pyplot()
+    groups = by_seed(shipped_runs())
+    figure, axes = plt.subplots(2, 2, figsize=(9, 7), layout="constrained", sharey=True)
+    for (title, lines), panel in zip(ABLATIONS.items(), axes.flat):
+        draw_groups(panel, groups, lines)
+        panel.set(title=title)
+    for panel in axes[:, 0]:
+        panel.set(ylabel="fractional success (axis-aligned)")
+    save(figure, folder, "figure5.png")
+
+
+def figure_6(folder):
+    """Figure 6: z in the plane (t-SNE), coloured by N; how far its distribution moves with N."""
+    plt = pyplot()
+    dots, drifts = read_text("figure6.csv"), read_text("figure6-drift.csv")
+    figure, axes = plt.subplots(2, 2, figsize=(9, 8), layout="constrained")
+    for encoder, panel in zip(("attn", "rn", "lrn"), axes.flat):
+        label, color = LINES[encoder]
+        of_it = [row for row in dots if row["encoder"] == encoder]
+        places = np.array([[row["x"], row["y"]] for row in of_it], float).reshape(-1, 2)
+        numbers = [int(row["distractors"]) for row in of_it]
+        points = panel.scatter(*places.T, s=2, c=numbers, cmap="viridis", vmin=0, vmax=9)
+        panel.set(title=f"z of {label}", xticks=[], yticks=[])
+        moved = [row for row in drifts if row["encoder"] == encoder]
+        axes[1, 1].plot([int(row["distractors"]) for row in moved],
+                        [float(row["distance"]) for row in moved], "o-", color=color, label=label)
+    figure.colorbar(points, ax=axes[1, 0], location="bottom", label="N")
+    axes[1, 1].set(title="energy distance of z at N from z at 2", xlabel="N", xticks=range(10),
+                   ylim=(0, None))
+    axes[1, 1].legend()
+    save(figure, folder, "figure6.png")
 
 
 def figure_7(folder):
@@ -240,7 +361,7 @@ def figure_8(folder):
             panel.plot(seconds, [float(row[kind]) for row in of_n], color=color, label=kind)
         panel.set(title=f"{N} distractors", xlabel="seconds", ylim=(0, None))
     axes[0].set(ylabel="mean norm of a relation")
-    axes[0].legend()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
     save(figure, folder, "figure8.png")
 
 
@@ -256,7 +377,10 @@ def save(figure, folder, name):
     print(f"wrote {path}")
 
 
-FIGURES = {"3": figure_3, "7": figure_7, "8": figure_8}        # number in the paper -> function
+FIGURES = {                              # number in the paper -> function
+    "1": figure_1, "3": figure_3, "4": figure_4, "5": figure_5, "6": figure_6, "7": figure_7,
+    "8": figure_8,
+}
 
 
 def main():

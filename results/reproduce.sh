@@ -3,7 +3,7 @@
 #
 #   results/reproduce.sh --list              every run and how far it is
 #   results/reproduce.sh                     whatever is left, one run after the other
-#   results/reproduce.sh --jobs 2 push       runs with "push" in their name, two side by side
+#   results/reproduce.sh --jobs 2 push       runs with "push" in their names, two side by side
 #
 # A run trains on one rank in runs/NAME (log: runs/NAME.log), is then played at all N, and a copy
 # without ballast goes to results/NAME. Stop with Ctrl-C: the next call goes on where it stopped.
@@ -12,19 +12,46 @@
 set -eu
 cd "$(dirname "$0")/.."
 
-# Lines "NAME ARGUMENTS OF train.py".
+# a_run TASK ENCODER N SEED [WORD, ARGUMENTS OF train.py]: prints "NAME ARGUMENTS OF train.py".
+a_run() {
+    echo "$1-$2-n$3${5:+-$5}-seed$4 --task $1 --encoder $2 --distractors $3 --seed $4 ${*:6}"
+}
+
+# The runs of all figures, those of the first seed first.
 all_runs() {
-    for seed in 0 1; do                                        # figure 3, top
+    for seed in 0 1 2 3 4; do
         for encoder in lrn rn attn; do
-            echo "push-$encoder-n2-seed$seed --encoder $encoder --seed $seed"
+            a_run push $encoder 2 $seed                        # figure 3, top
         done
+        if [ $seed -le 2 ]; then
+            for encoder in lrn rn attn; do
+                a_run lift $encoder 2 $seed                    # figure 3, bottom
+            done
+            a_run push lrn-max 2 $seed
+            for N in 0 1 3; do                                 # figure 4, and LRN of figure 1
+                for encoder in lrn rn attn; do
+                    a_run push $encoder $N $seed
+                done
+            done
+            a_run push lrn 2 $seed norelations --set relations=False    # figure 5, left
+            a_run push lrn 2 $seed mean --set layer_norm=False
+            for width in 10 50 100; do
+                a_run push lrn 2 $seed z$width --set z_dim=$width
+            done
+            a_run push lrn 2 $seed nooverlap --set reward_overlap=0     # figure 5, right
+            a_run push lrn 2 $seed nodistance --set reward_distance=0
+            a_run push lrn 2 $seed noreach --set reward_reach=0
+            a_run push lrn 2 $seed curiosity --set reward_curiosity=10
+        fi
+        if [ $seed -le 1 ]; then
+            for N in 0 1 2; do                                 # MLP of figure 1
+                a_run push mlp $N $seed "" --frames 9000000
+            done
+        fi
+        if [ $seed = 0 ]; then
+            a_run lift lrn 0 $seed
+        fi
     done
-    for seed in 0 1; do                                        # figure 3, bottom
-        for encoder in lrn rn attn; do
-            echo "lift-$encoder-n2-seed$seed --encoder $encoder --seed $seed --task lift"
-        done
-    done
-    echo "lift-lrn-n0-seed0 --encoder lrn --seed 0 --task lift --distractors 0"
 }
 
 state_of() {
@@ -52,7 +79,11 @@ one_run() {
         echo "$name: stopped before its end"
         exit 255                                               # xargs starts no other run then
     fi
-    python evaluate.py "runs/$name" --distractors 0-9,14,19 --save >> "$log" 2>&1
+    numbers=0-9,14,19
+    if [[ $name =~ -mlp-n([0-9]+) ]]; then
+        numbers=${BASH_REMATCH[1]}                             # it can play no other N
+    fi
+    python evaluate.py "runs/$name" --distractors "$numbers" --save >> "$log" 2>&1
     python results/ship.py "runs/$name"
     echo "$name: done"
 }
@@ -70,7 +101,7 @@ done
 pattern=${1:-.}
 if [ "$list" ]; then
     all_runs | grep -e "$pattern" | while read -r name arguments; do
-        printf "%-24s %-24s %s\n" "$name" "$(state_of "$name")" "$arguments"
+        printf "%-30s %-24s %s\n" "$name" "$(state_of "$name")" "$arguments"
     done
     exit
 fi
