@@ -5,7 +5,7 @@
 #   results/reproduce.sh                     whatever is left, one run after the other
 #   results/reproduce.sh --jobs 2 push       runs with "push" in their names, two side by side
 #
-# A run trains on one rank in runs/NAME (log: runs/NAME.log), is then played at all N, and a copy
+# A run trains on one rank in runs/NAME (log: runs/NAME.log), is then played at other N, and a copy
 # without ballast goes to results/NAME. Stop with Ctrl-C: the next call goes on where it stopped.
 # A run is done when results/NAME/zeroshot.csv is there; to train a shipped one anew, remove its
 # folder first.
@@ -79,7 +79,10 @@ one_run() {
         echo "$name: stopped before its end"
         exit 255                                               # xargs starts no other run then
     fi
-    numbers=0-9,14,19
+    numbers=0-9
+    if [[ $name =~ -n2-seed ]]; then
+        numbers=0-9,14,19                                      # figure 3
+    fi
     if [[ $name =~ -mlp-n([0-9]+) ]]; then
         numbers=${BASH_REMATCH[1]}                             # it can play no other N
     fi
