@@ -3240,6 +3240,27 @@ def test_every_shipped_run_has_its_command():
     assert shipped and set(shipped) <= set(names)
 
 
+def test_a_recentred_lrn_is_the_same_at_its_n_and_ignores_constant_distractors(results_scripts):
+    import recentre
+
+    torch.manual_seed(0)
+    agent = train.Agent("lrn", 2, train.DEFAULTS)
+    encoder = agent.encoder
+    torch.nn.init.normal_(encoder.g[5].bias)
+    torch.nn.init.normal_(encoder.f.bias)
+    objects, goal = torch.randn(4, 6, 64), torch.randn(4, 64)
+    copies = objects[:, :1].expand(-1, 3, -1)                  # three more of the first object
+    with torch.no_grad():
+        before = encoder(objects, goal)
+        c = encoder.relations(objects[:1], goal[:1])[0, 0]     # what scene 0's first object adds
+        weights = {f"agent.{name}": value for name, value in agent.state_dict().items()}
+        recentre.recentre(weights, c, 6)
+        torch.testing.assert_close(encoder(objects, goal), before, atol=1e-5, rtol=1e-4)
+        more = encoder(torch.cat([objects, copies], dim=1), goal)
+    torch.testing.assert_close(more[0], before[0], atol=1e-5, rtol=1e-4)
+    assert (more[1] - before[1]).abs().max() > 0.1             # there c is not what the first adds
+
+
 def test_relations_are_told_apart_by_kind(results_scripts):
     """Fingers, target, distractors, whichever cube the target is."""
     import inside

@@ -120,7 +120,7 @@ def main():
             print(f"{run} N={N} {name}: success {row['success_aabb']:.2f} +- {row['ci95']:.2f}, "
                   f"read error {1000 * row['read_error']:.1f} mm", flush=True)
         if agent.kind == "lrn":
-            print_lengths(run, 9, args.episodes)
+            print_lengths(run, N, args.episodes)
 
 
 if __name__ == "__main__":
