@@ -3154,6 +3154,8 @@ def test_table_puts_seeds_together(tmp_path, results_scripts):
     assert aligned[2] == ("| push-lrn-n2 | 3 | 6.0 | 30, 31, 32 | "
                           "0.80 ± 0.25<br>0.90, 0.70, 0.80 |")
     assert aligned[3] == "| push-mlp-n2 | 1 | 6.0 | 30 | 0.50 ± 0.03 |"
+    two = figures.table(lrn[:2], "success_aabb")
+    assert two[2] == "| push-lrn-n2 | 2 | 6.0 | 30, 31 | 0.80<br>0.90, 0.70 |"
     assert solved[0].startswith("| solved |")
     assert solved[3].endswith("| 0.50 ± 0.10 |")               # 1.96 * sqrt(0.5 * 0.5 / 100)
     cell = figures.over_seeds(lrn, "success_aabb")[2]

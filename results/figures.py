@@ -133,9 +133,13 @@ def cell(values, bars):
 
 def over_seeds(runs, measure):
     """{N: Cell} of a measure over runs that differ in the seed alone."""
+    return over_tables([read(run, "zeroshot.csv") for run in runs], measure)
+
+
+def over_tables(tables, measure):
+    """The same of what was read from several zeroshot.csv."""
     values, bars = {}, {}
-    for run in runs:
-        rows = read(run, "zeroshot.csv")
+    for rows in tables:
         for i, n in enumerate(rows["distractors"].astype(int).tolist()):
             values.setdefault(n, []).append(rows[measure][i])
             bars.setdefault(n, []).append(bar_of(rows, i, measure))
@@ -145,8 +149,11 @@ def over_seeds(runs, measure):
 # ---- tables
 
 def cell_text(cell):
-    """'0.80 ± 0.25' and, for several seeds, each of them on a second line."""
-    text = f"{cell.values.mean():.2f} ± {cell.half:.2f}"
+    """'0.80 ± 0.25' and, for several seeds, each of them on a second line. Two seeds have no
+    interval: Student's t makes it longer than the scale."""
+    text = f"{cell.values.mean():.2f}"
+    if len(cell.values) != 2:
+        text += f" ± {cell.half:.2f}"
     if len(cell.values) > 1:
         text += "<br>" + ", ".join(f"{value:.2f}" for value in cell.values)
     return text
@@ -212,11 +219,19 @@ def draw(axes, x, curves, label, color, marker=None):
     axes.fill_between(x, lowest, highest, color=color, alpha=0.15, linewidth=0)
 
 
-def draw_zero_shot(axes, runs, label, color):
-    """Scores of runs of several seeds at every N."""
-    cells = over_seeds(runs, "success_aabb")
-    values = np.array([cells[n].values for n in cells]).T      # (S, numbers)
-    draw(axes, list(cells), values, label, color, marker="o")
+def draw_zero_shot(axes, cells, label, color, marker="o"):
+    """Scores {N: Cell} of several seeds at every N."""
+    values = np.array([cell.values for cell in cells.values()]).T          # (S, numbers)
+    draw(axes, list(cells), values, label, color, marker)
+
+
+def draw_recentred(axes, task):
+    """LRN after recentre.py: scores in recentred/."""
+    paths = sorted(glob.glob(f"{HERE}/recentred/{task}-lrn-n2-seed?.csv"))
+    if paths:
+        tables = [read(*os.path.split(path)) for path in paths]
+        cells = over_tables(tables, "success_aabb")
+        draw_zero_shot(axes, cells, "LRN, recentred", "#56B4E9", marker="^")
 
 
 def with_seeds(label, runs):
@@ -228,7 +243,8 @@ def draw_groups(axes, groups, lines):
     """Zero-shot curves of some groups of runs, {group: label}; one without runs is said so."""
     for (group, label), color in zip(lines.items(), FOUR):
         if group in groups:
-            draw_zero_shot(axes, groups[group], with_seeds(label, groups[group]), color)
+            cells = over_seeds(groups[group], "success_aabb")
+            draw_zero_shot(axes, cells, with_seeds(label, groups[group]), color)
         else:
             axes.plot([], [], color=color, label=f"{label} (not run)")
     axes.set(xlabel="N, distractors at test time", xlim=(-0.4, 9.4), ylim=(0, 1), xticks=range(10))
@@ -280,12 +296,14 @@ def figure_3(folder):
             progress = [smooth(read(run, "progress.csv"), "success_aabb") for run in runs]
             curves = [success for _, success in progress]
             draw(left, progress[0][0], curves, with_seeds(label, runs), color)
-            draw_zero_shot(right, runs, label, color)
+            draw_zero_shot(right, over_seeds(runs, "success_aabb"), label, color)
+        draw_recentred(right, task)
         left.set(title=f"{TASKS[task]}: training at N = 2", xlabel="million frames",
                  ylabel="fractional success (axis-aligned)", ylim=(0, 1))
         right.set(title=f"{TASKS[task]}: zero-shot", xlabel="N, distractors at test time",
                   ylim=(0, 1), xticks=[0, 2, 5, 9, 14, 19])
         left.legend(loc="lower right")
+        right.legend(loc="lower left")
     save(figure, folder, "figure3.png")
 
 
