@@ -2106,12 +2106,13 @@ def test_paper_sets_the_numbers_that_the_paper_prints(tmp_path):
     assert settings == {**train.DEFAULTS, "frames": 77, "lr_power": 1.0}
 
 
-def test_lifting_has_frames_and_a_schedule_of_its_own(tmp_path):
+def test_lifting_has_frames_schedule_and_noise_of_its_own(tmp_path):
     out = str(tmp_path / "run")
-    for words, power in (("", 1), ("--task lift", 2), ("--task lift --paper", 1),
-                         ("--task lift --set lr_power=3", 3)):
+    for words, power, log_std in (("", 1, -0.7), ("--task lift", 2, -1), ("--paper", 1, 0),
+                                  ("--task lift --paper", 1, 0),
+                                  ("--task lift --set lr_power=3 log_std=-2", 3, -2)):
         _, settings = train.parse(["--out", out, *words.split()])
-        assert settings["lr_power"] == power, words
+        assert (settings["lr_power"], settings["log_std"]) == (power, log_std), words
     for words, frames in (("", 3_000_000), ("--task lift", 6_000_000), ("--paper", 60_000_000),
                           ("--task lift --paper", 60_000_000), ("--task lift --frames 9", 9),
                           ("--task lift --set frames=7", 7)):
@@ -3669,7 +3670,9 @@ MUTATIONS = {
         ("setting.paper if args.paper else setting.default", "setting.default",
          "test_paper_sets_the_numbers_that_the_paper_prints"),
         ("if args.task == \"lift\" and not args.paper:", "if args.task == \"lift\":",
-         "test_lifting_has_frames_and_a_schedule_of_its_own"),
+         "test_lifting_has_frames_schedule_and_noise_of_its_own"),
+        ("\"lr_power\": 2.0, \"log_std\": -1.0}", "\"lr_power\": 2.0}",
+         "test_lifting_has_frames_schedule_and_noise_of_its_own"),
         ("Setting(0.2, 0.5, \"A.2\")", "Setting(0.2, 0.2, \"A.2\")",
          "test_paper_sets_the_numbers_that_the_paper_prints"),
         ("        refuse_if_without_effect(name, args.encoder)\n", "",
