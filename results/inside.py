@@ -35,12 +35,11 @@ POINTS = 5000                            # most points that t-SNE and distances 
 
 @torch.inference_mode()
 def watch(run, distractors, episodes, look):
-    """look(agent, obs) -> (B, ...) after every step of every episode: (steps, E, ...)."""
+    """look(agent, obs) -> (B, ...) after every step of the `episodes` (a range): (steps, E, ...)."""
     checkpoint, agent = load(run)
     seen = []
-    for first in range(0, episodes, evaluate.CHUNK):
-        last = min(first + evaluate.CHUNK, episodes)
-        seeds = [evaluate.episode_seed(e) for e in range(first, last)]
+    for first in range(0, len(episodes), evaluate.CHUNK):
+        seeds = [evaluate.episode_seed(e) for e in episodes[first:first + evaluate.CHUNK]]
         envs, observations, _ = evaluate.start(checkpoint, agent, distractors, seeds)
         noise = [np.random.default_rng(seed) for seed in seeds]
         steps = []
@@ -174,7 +173,7 @@ def main():
     torch.set_num_threads(1)
     try:
         for figure in args.figures or FIGURES:
-            FIGURES[figure](args.episodes)
+            FIGURES[figure](range(args.episodes))
     except (ValueError, OSError) as error:
         fail(str(error))
 

@@ -1,13 +1,15 @@
-"""Give a trained LRN the zero that training at one N cannot find: its distractors' relations.
+"""Give a trained LRN the zero that training at one N cannot find: its distractors' mean relation.
 
     python results/recentre.py results/lift-lrn-n2-seed0 runs/lift-recentred
     python evaluate.py runs/lift-recentred
 
-With K objects in training, f(sum_i r_i) stays the same if a vector c is taken from every r_i (from
-the bias of g's last layer) and K f(c) is added to f's bias. So training at a single K leaves c open,
-and any c but one makes z move with every further distractor. This script moves the bias so that
-distractors' relations are zero on the average over episodes at the N of training. Nothing is
-learned, no other N is looked at, and at the N of training the agent does the same as before.
+f is affine, f(x) = W x + b. With K objects in training, f(sum_i r_i) stays the same if a vector c
+is taken from every r_i (from the last bias of g) and K W c is added to b. So training at a single
+K leaves c open, and z moves with every further distractor unless c makes their relations small.
+This script moves the two biases so that distractors' relations are zero on the average over
+episodes at the N of training (others than those of evaluate.py). It is told which cubes are
+distractors; nothing is learned, no other N is looked at, and at the N of training z stays the same
+up to rounding.
 """
 import argparse
 import os
@@ -19,11 +21,15 @@ sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import inside
 from train import fail, load, save
 
+FIRST = 10_000                           # number of the first episode: far from evaluate.py's
+
 
 def mean_distractor(run, distractors, episodes):
     """(D,) mean relation of a distractor over whole episodes."""
-    r = inside.watch(run, distractors, episodes, inside.relations_of)      # (steps, E, K, D)
-    return torch.from_numpy(r[:, :, 4:].mean(axis=(0, 1, 2)))
+    which = range(FIRST, FIRST + episodes)
+    r = inside.watch(run, distractors, which, inside.relations_of)         # (steps, E, K, D)
+    others = r[:, :, 4:]                                       # without fingers and target
+    return torch.from_numpy(others.mean(axis=(0, 1, 2)))
 
 
 def recentre(weights, c, K):
@@ -31,6 +37,23 @@ def recentre(weights, c, K):
     last, f = "agent.encoder.g.5.bias", "agent.encoder.f"
     weights[last] -= c
     weights[f + ".bias"] += K * (weights[f + ".weight"] @ c)
+
+
+def write_recentred(run, folder, episodes):
+    """Write the recentred checkpoint of a run; returns c. ValueError for one that has no c."""
+    checkpoint, agent = load(run)
+    T = agent.distractors
+    if agent.kind != "lrn" or not T or not agent.encoder.with_norm:
+        raise ValueError(f"{run}: needs an lrn agent trained with distractors, and with LayerNorm")
+    path = os.path.join(folder, "checkpoint.pt")
+    if os.path.exists(path):
+        raise ValueError(f"{path} is there already: name another folder")
+    c = mean_distractor(run, T, episodes)
+    recentre(checkpoint["learner"], c, T + 4)
+    checkpoint.pop("optimizer", None)                          # its moments are of other weights
+    os.makedirs(folder, exist_ok=True)
+    save(checkpoint, path)
+    return c
 
 
 def main():
@@ -43,14 +66,7 @@ def main():
     args = parser.parse_args()
     torch.set_num_threads(1)
     try:
-        checkpoint, agent = load(args.run)
-        if agent.kind != "lrn" or not agent.distractors:
-            raise ValueError(f"{args.run}: needs an lrn agent trained with distractors")
-        N = agent.distractors
-        c = mean_distractor(args.run, N, args.episodes)
-        recentre(checkpoint["learner"], c, N + 4)
-        os.makedirs(args.out, exist_ok=True)
-        save(checkpoint, os.path.join(args.out, "checkpoint.pt"))
+        c = write_recentred(args.run, args.out, args.episodes)
     except (ValueError, OSError) as error:
         fail(str(error))
     print(f"wrote {args.out}: a vector of length {c.norm():.2f} taken from every relation")
