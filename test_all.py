@@ -3183,11 +3183,22 @@ def test_figures_are_drawn_and_tables_printed(tmp_path):
     done = run("results/figures.py", "9")
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (optional)")
-    numbers = ("1", "3", "4", "5")
-    done = run("results/figures.py", *numbers, "--out", str(tmp_path))
+    done = run("results/figures.py", "--out", str(tmp_path))   # all that there are numbers for
     assert done.returncode == 0, done.stderr
-    for number in numbers:
+    for number in "378":
         assert (tmp_path / f"figure{number}.png").read_bytes().startswith(b"\x89PNG")
+    lines = done.stdout.splitlines()
+    assert len(lines) == 7 and all(line.startswith(("wrote ", "no figure ")) for line in lines)
+
+
+def test_tables_of_the_notebook_are_those_of_the_files():
+    with open(os.path.join(HERE, "results", "README.md")) as file:
+        notebook = file.read().splitlines()
+    for command in (("results/figures.py", "table"), ("results/search.py",)):
+        done = run(*command)
+        assert done.returncode == 0, done.stderr
+        printed = [line for line in done.stdout.splitlines() if line.startswith("|")]
+        assert len(printed) > 10 and set(printed) <= set(notebook), command
 
 
 def test_shipped_curves_stand_for_windows_of_updates(results_scripts, monkeypatch):
@@ -3262,6 +3273,34 @@ def test_a_recentred_lrn_is_the_same_at_its_n_and_ignores_constant_distractors(r
         more = encoder(torch.cat([objects, copies], dim=1), goal)
     torch.testing.assert_close(more[0], before[0], atol=1e-5, rtol=1e-4)
     assert (more[1] - before[1]).abs().max() > 0.1             # there c is not what the first adds
+
+
+def test_recentring_a_run_is_measured_in_other_episodes_and_overwrites_nothing(
+        trained, tmp_path, results_scripts, monkeypatch):
+    """What distractors add is zero on the average afterwards, in the episodes that were played."""
+    import recentre
+
+    checkpoint, _ = train.load(trained)
+    assert "optimizer" in checkpoint
+    checkpoint["distractors"] = 2                              # nothing in an LRN depends on N
+    (tmp_path / "run").mkdir()
+    train.save(checkpoint, str(tmp_path / "run" / "checkpoint.pt"))
+    before = recentre.mean_distractor(str(tmp_path / "run"), 2, 2)
+    recentre.write_recentred(str(tmp_path / "run"), str(tmp_path / "out"), 2)
+    # The agent acts as before, so it plays the same episodes.
+    after = recentre.mean_distractor(str(tmp_path / "out"), 2, 2)
+    assert after.norm() < 1e-3 * before.norm()
+    assert "optimizer" not in train.load(str(tmp_path / "out"))[0]
+    with pytest.raises(ValueError, match="there already"):
+        recentre.write_recentred(str(tmp_path / "run"), str(tmp_path / "out"), 2)
+
+    for change in ({"encoder": "rn"}, {"distractors": 0},
+                   {"settings": {**checkpoint["settings"], "layer_norm": False}}):
+        other = {**checkpoint, **change}
+        agent = train.Agent(other["encoder"], other["distractors"], other["settings"])
+        monkeypatch.setattr(recentre, "load", lambda run: (other, agent))
+        with pytest.raises(ValueError, match="needs an lrn agent"):
+            recentre.write_recentred(trained, str(tmp_path / "none"), 2)
 
 
 def test_relations_are_told_apart_by_kind(results_scripts):

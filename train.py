@@ -86,7 +86,7 @@ SETTINGS = {
     "heads": Setting(4, 4, "of ATTN; not printed"),
     "relations": Setting(True, True, "False: LRN without relations (figure 5)"),
     "layer_norm": Setting(True, True, "False: LRN with a mean instead (figure 5)"),
-    "log_std": Setting(-0.7, 0.0, "initial log standard deviation of the actions; rlpyt: 0"),
+    "log_std": Setting(-0.7, 0.0, "of the actions, at the start; rlpyt: 0. -1 learns later"),
 }
 # LiftingCube takes longer, most of its score comes while the learning rate is small, and noise costs
 # it more.

@@ -1,6 +1,6 @@
 """Draw the figures and print the tables of this folder from the CSV files of its runs.
 
-    python results/figures.py              every figure: results/figure3.png and others
+    python results/figures.py              every figure that there are numbers for
     python results/figures.py 3            one of them
     python results/figures.py table        the tables, in markdown
     python results/figures.py 3 --out .    into another folder
@@ -266,6 +266,7 @@ def figure_1(folder):
     """Figure 1, right: frames until training success is 0.5 and 0.8, by the N of training."""
     plt = pyplot()
     groups = by_seed(shipped_runs())
+    need_runs(groups, [f"push-mlp-n{N}" for N in range(3)])
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained", sharey=True)
     for threshold, panel in zip((0.5, 0.8), axes):
         for encoder, label, color in (("mlp", "MLP", FOUR[1]), ("lrn", "LRN", FOUR[0])):
@@ -311,6 +312,7 @@ def figure_4(folder):
     """Figure 4: zero-shot scores of agents trained at 0, 1, 2 and 3 distractors."""
     plt = pyplot()
     groups = by_seed(shipped_runs())
+    need_runs(groups, [f"push-{encoder}-n{N}" for encoder in LINES for N in (0, 1, 3)])
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.5), layout="constrained", sharey=True)
     for encoder, panel in zip(("attn", "rn", "lrn"), axes):
         draw_groups(panel, groups, {f"push-{encoder}-n{N}": f"trained at {N}" for N in range(4)})
@@ -323,6 +325,7 @@ def figure_5(folder):
     """Figure 5: zero-shot scores of LRN with parts of it, and of the reward, changed."""
     plt = pyplot()
     groups = by_seed(shipped_runs())
+    need_runs(groups, [name for lines in ABLATIONS.values() for name in list(lines)[1:]])
     figure, axes = plt.subplots(2, 2, figsize=(9, 7), layout="constrained", sharey=True)
     for (title, lines), panel in zip(ABLATIONS.items(), axes.flat):
         draw_groups(panel, groups, lines)
@@ -385,8 +388,17 @@ def figure_8(folder):
 
 def read_text(name):
     """Rows (dicts of text) of a CSV in this folder."""
-    with open(os.path.join(HERE, name), newline="") as file:
-        return list(csv.DictReader(file))
+    try:
+        with open(os.path.join(HERE, name), newline="") as file:
+            return list(csv.DictReader(file))
+    except FileNotFoundError:
+        raise ValueError(f"{name} is not there: python results/inside.py makes it") from None
+
+
+def need_runs(groups, names):
+    """ValueError if none of the groups of runs is there."""
+    if not set(groups) & set(names):
+        raise ValueError(f"none of its runs is there, such as {names[0]}: see results/reproduce.sh")
 
 
 def save(figure, folder, name):
@@ -411,14 +423,16 @@ def main():
     for what in args.what:
         if what not in FIGURES and what != "table":
             fail(f"there is no figure {what}; there are {', '.join(FIGURES)} and table")
-    try:
-        for what in args.what or FIGURES:
+    for what in args.what or FIGURES:
+        try:
             if what == "table":
                 print_tables(shipped_runs())
             else:
                 FIGURES[what](args.out)
-    except (ValueError, OSError) as error:
-        fail(str(error))
+        except (ValueError, OSError) as error:
+            if args.what:
+                fail(f"figure {what}: {error}")
+            print(f"no figure {what}: {error}")
 
 
 if __name__ == "__main__":

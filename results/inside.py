@@ -35,7 +35,7 @@ POINTS = 5000                            # most points that t-SNE and distances 
 
 @torch.inference_mode()
 def watch(run, distractors, episodes, look):
-    """look(agent, obs) -> (B, ...) after every step of the `episodes` (a range): (steps, E, ...)."""
+    """look(agent, obs) -> (B, ...) after every step of `episodes` (a range): (steps, E, ...)."""
     checkpoint, agent = load(run)
     seen = []
     for first in range(0, len(episodes), evaluate.CHUNK):

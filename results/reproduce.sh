@@ -7,8 +7,8 @@
 #
 # A run trains on one rank in runs/NAME (log: runs/NAME.log), is then played at other N, and a copy
 # without ballast goes to results/NAME. Stop with Ctrl-C: the next call goes on where it stopped.
-# A run is done when results/NAME/zeroshot.csv is there; to train a shipped one anew, remove its
-# folder first.
+# A run is done when results/NAME/zeroshot.csv is there; to train a shipped one anew, remove
+# results/NAME and runs/NAME first. LRN's runs of figure 3 are also played recentred.
 set -eu
 cd "$(dirname "$0")/.."
 
@@ -74,9 +74,9 @@ one_run() {
         resume=--resume
     fi
     echo "$name: $*" | tee -a "$log"
-    python train.py "$@" --ranks 1 --out "runs/$name" $resume >> "$log" 2>&1
-    if ! tail -n 1 "$log" | grep -q "^finished"; then
-        echo "$name: stopped before its end"
+    if ! python train.py "$@" --ranks 1 --out "runs/$name" $resume >> "$log" 2>&1 ||
+            ! tail -n 1 "$log" | grep -q "^finished"; then
+        echo "$name: not finished, see $log"
         exit 255                                               # xargs starts no other run then
     fi
     numbers=0-9
@@ -87,6 +87,12 @@ one_run() {
         numbers=${BASH_REMATCH[1]}                             # it can play no other N
     fi
     python evaluate.py "runs/$name" --distractors "$numbers" --save >> "$log" 2>&1
+    if [[ $name =~ -lrn-n2-seed ]]; then
+        rm -rf "runs/$name-recentred"
+        python results/recentre.py "runs/$name" "runs/$name-recentred"
+        python evaluate.py "runs/$name-recentred" --distractors 0,2,5,9,14,19 --save >> "$log" 2>&1
+        cp "runs/$name-recentred/zeroshot.csv" "results/recentred/$name.csv"
+    fi
     python results/ship.py "runs/$name"
     echo "$name: done"
 }
@@ -103,12 +109,12 @@ while [ $# -gt 0 ]; do
 done
 pattern=${1:-.}
 if [ "$list" ]; then
-    all_runs | grep -e "$pattern" | while read -r name arguments; do
+    all_runs | awk -v pattern="$pattern" '$1 ~ pattern' | while read -r name arguments; do
         printf "%-30s %-24s %s\n" "$name" "$(state_of "$name")" "$arguments"
     done
     exit
 fi
-all_runs | grep -e "^[^ ]*$pattern" | while read -r name arguments; do
+all_runs | awk -v pattern="$pattern" '$1 ~ pattern' | while read -r name arguments; do
     if [ "$(state_of "$name")" != "done" ]; then
         echo "$name $arguments"
     fi
