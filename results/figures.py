@@ -263,19 +263,21 @@ def frames_to(runs, threshold):
 
 
 def figure_1(folder):
-    """Figure 1, right: frames until training success is 0.5 and 0.8, by the N of training."""
+    """Figure 1, right: frames until training success is 0.5 and 0.8, by the N of training; "never" is
+    within the run's frames (reproduce.sh gives the MLP three times as many)."""
     plt = pyplot()
     groups = by_seed(shipped_runs())
     need_runs(groups, [f"push-mlp-n{N}" for N in range(3)])
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained", sharey=True)
     for threshold, panel in zip((0.5, 0.8), axes):
-        for encoder, label, color in (("mlp", "MLP", FOUR[1]), ("lrn", "LRN", FOUR[0])):
+        for encoder, color, down in (("mlp", FOUR[1], 14), ("lrn", FOUR[0], 28)):
+            label = encoder.upper()
             for N in range(4):
                 frames = frames_to(groups.get(f"push-{encoder}-n{N}", []), threshold)
                 panel.plot([N] * len(frames), frames, "o", color=color, alpha=0.7,
                            label=label if N == 0 else None)
                 if np.isnan(frames).any():
-                    panel.annotate(f"{label}: never", (N, 1), (0, -14), color=color, ha="center",
+                    panel.annotate(f"{label}: never", (N, 1), (0, -down), color=color, ha="center",
                                    xycoords=("data", "axes fraction"), textcoords="offset points")
         panel.set(title=f"PushingCube: frames to reach {threshold}", xlabel="N in training",
                   xticks=range(4), xlim=(-0.5, 3.5))
