@@ -1,7 +1,7 @@
 """Tests of everything, each against something independent: a slow loop, torch's own layer,
 PyBullet, a hand-computed case, or a planted defect that has to turn it red.
 
-Run:    pytest -q                                        under 3 minutes on 2 cores
+Run:    pytest -q                                        3 to 4 minutes on 2 cores
         SLOW=1 pytest -q -s -k "soak or killed_and or mutation"
                                  12 M environment steps, 40 kills, every planted defect: hours
 """
