@@ -8,9 +8,8 @@
 
 Episode j starts from the same seed at every N and for every agent: goal and target cube stand in
 the same places, only the distractors differ (and a lifting goal's height, which is drawn after
-them). The seeds belong to no training run. The paper does
-not say whether its scores are of sampled actions or of the policy's means; CausalWorld's evaluation
-plays the means, and so do we.
+them). The seeds belong to no training run. The paper does not say whether its scores are of sampled
+actions or of the policy's means; CausalWorld's evaluation plays the means, and so do we.
 """
 import argparse
 import csv

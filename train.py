@@ -88,8 +88,8 @@ SETTINGS = {
     "layer_norm": Setting(True, True, "False: LRN with a mean instead (figure 5)"),
     "log_std": Setting(-0.7, 0.0, "of the actions, at the start; rlpyt: 0. -1 learns later"),
 }
-# LiftingCube takes longer, most of its score comes while the learning rate is small, and noise costs
-# it more.
+# LiftingCube takes longer, most of its score comes while the learning rate is small, and noise
+# costs it more.
 LIFT_SETTINGS = {"frames": 6_000_000, "lr_power": 2.0, "log_std": -1.0}
 DEFAULTS = {name: setting.default for name, setting in SETTINGS.items()}
 ENV_SETTINGS = ("episode_steps", "substeps", "timestep", "action_mode", "action_scale",

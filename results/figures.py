@@ -263,8 +263,10 @@ def frames_to(runs, threshold):
 
 
 def figure_1(folder):
-    """Figure 1, right: frames until training success is 0.5 and 0.8, by the N of training; "never" is
-    within the run's frames (reproduce.sh gives the MLP three times as many)."""
+    """Figure 1, right: frames until training success is 0.5 and 0.8, by the N of training.
+
+    "Never" is within the run's frames (reproduce.sh gives the MLP three times as many).
+    """
     plt = pyplot()
     groups = by_seed(shipped_runs())
     need_runs(groups, [f"push-mlp-n{N}" for N in range(3)])
