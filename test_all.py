@@ -2208,7 +2208,9 @@ def test_progress_tells_of_every_update(trained):
     seconds = np.diff([row["seconds"] for row in timing])
     rates = [row["frames_per_second"] for row in timing[1:]]
     np.testing.assert_allclose(seconds * rates, 400, rtol=0.2)             # both are rounded
-    assert all(0.05 < row["rollout_share"] < 1 for row in timing)
+    shares = [row["rollout_share"] for row in timing]
+    assert 0.05 < np.median(shares) < 0.95                     # a busy machine may stall any one
+    assert min(shares) >= 0 and max(shares) <= 1
 
 
 def test_first_row_of_two_ranks_is_about_the_episodes_of_both(trained):

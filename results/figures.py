@@ -26,13 +26,13 @@ MEASURES = {                             # column of zeroshot.csv -> title of it
 # Student's t for a 95 % interval, by the number of seeds
 STUDENT = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776}
 TASKS = {"push": "PushingCube", "lift": "LiftingCube"}
+BLUE, RED, GREEN, YELLOW = FOUR = ("#0072B2", "#CC3311", "#009E73", "#AA8800")
 LINES = {                                # of figures 3, 4 and 6: encoder -> label, colour
-    "lrn": ("LRN", "#0072B2"),
-    "rn": ("RN", "#009E73"),
-    "attn": ("ATTN", "#CC3311"),
-    "lrn-max": ("LRN-max", "#AA8800"),
+    "lrn": ("LRN", BLUE),
+    "rn": ("RN", GREEN),
+    "attn": ("ATTN", RED),
+    "lrn-max": ("LRN-max", YELLOW),
 }
-FOUR = ("#0072B2", "#CC3311", "#009E73", "#AA8800")            # colours of at most four lines
 ABLATIONS = {                            # panels of figure 5: title -> {group of runs: label}
     "Relations, LayerNorm": {
         "push-lrn-n2": "LRN",
@@ -272,7 +272,7 @@ def figure_1(folder):
     need_runs(groups, [f"push-mlp-n{N}" for N in range(3)])
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained", sharey=True)
     for threshold, panel in zip((0.5, 0.8), axes):
-        for encoder, color, down in (("mlp", FOUR[1], 14), ("lrn", FOUR[0], 28)):
+        for encoder, color, down in (("mlp", RED, 14), ("lrn", BLUE, 28)):
             label = encoder.upper()
             for N in range(4):
                 frames = frames_to(groups.get(f"push-{encoder}-n{N}", []), threshold)
