@@ -1948,27 +1948,26 @@ class Asked:
 
 
 def ask():
-    """What encode() gets to see in two calls of auxiliary(), what it answers, and the loss."""
+    """What auxiliary() gets, what encode() sees in two calls of it and answers, and the loss."""
     agent = train.Agent("lrn", 2, train.DEFAULTS)
     agent.encode, agent.read_out = Asked(), nn.Identity()
     torch.manual_seed(0)
-    obs = {"cubes": torch.randn(4000, 3, 18), "fingers": torch.randn(4000, 3, 10),
-           "goal": torch.randn(4000, 12)}
+    obs = {"cubes": torch.randn(1000, 3, 18), "fingers": torch.randn(1000, 3, 10),
+           "goal": torch.randn(1000, 12)}
     before = {key: value.clone() for key, value in obs.items()}
     loss = agent.auxiliary(obs)
     agent.auxiliary(obs)
     assert all(torch.equal(obs[key], before[key]) for key in obs)          # a copy was changed
-    quarter = {key: value[::4] for key, value in obs.items()}
     first, second = agent.encode.obs
-    return quarter, first, second, agent.encode.answers[0], loss.item()
+    return obs, first, second, agent.encode.answers[0], loss.item()
 
 
 def test_read_out_loss_asks_about_fresh_goals_targets_and_identifiers():
-    quarter, asked, again, _, _ = ask()
+    obs, asked, again, _, _ = ask()
     identifiers = asked["cubes"][..., 17]
     assert asked["cubes"].shape == (1000, 3, 18)
-    assert torch.equal(asked["cubes"][..., :17], quarter["cubes"][..., :17])
-    assert torch.equal(asked["fingers"], quarter["fingers"])
+    assert torch.equal(asked["cubes"][..., :17], obs["cubes"][..., :17])
+    assert torch.equal(asked["fingers"], obs["fingers"])
 
     # Identifiers: from the pool, each equally often, distinct in a sample, anew in every call.
     # 45.3 and 13.8: what chi-square exceeds once in 1000 with 20 and with 2 degrees of freedom.
@@ -1985,7 +1984,7 @@ def test_read_out_loss_asks_about_fresh_goals_targets_and_identifiers():
     assert np.square(counts - 1000 / 3).sum() / (1000 / 3) < 13.8
 
     # Goals: those of the batch, in another order.
-    own, other = quarter["goal"][:, 4:7], asked["goal"][:, 4:7]
+    own, other = obs["goal"][:, 4:7], asked["goal"][:, 4:7]
     assert (own == other).all(1).float().mean() < 0.01
     assert sorted(own.tolist()) == sorted(other.tolist())
 

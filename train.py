@@ -199,7 +199,6 @@ class Agent(nn.Module):
         episodes, so few answers to "which cube is meant?". Hence the question is asked anew: every
         sample gets fresh identifiers, a random cube as target and the goal of another sample.
         """
-        obs = {key: value[::4] for key, value in obs.items()}  # rows are shuffled: take a quarter
         cubes, goal = obs["cubes"].clone(), obs["goal"]
         B, count = cubes.shape[:2]
         rows, target = torch.arange(B), torch.randint(count, (B,))
