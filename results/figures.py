@@ -308,7 +308,7 @@ def figure_3(folder):
         right.set(title=f"{TASKS[task]}: zero-shot", xlabel="N, distractors at test time",
                   ylim=(0, 1), xticks=[0, 2, 5, 9, 14, 19])
         left.legend(loc="lower right")
-        right.legend(loc="lower left")
+        right.legend(loc="lower left", fontsize=8)
     save(figure, folder, "figure3.png")
 
 
