@@ -1,6 +1,6 @@
 """Self-attention encoder: the paper's baseline (appendix A.4, figure 2 box A).
 
-    o_attn = softmax(q(o) k(o)^T / sqrt(D)) v(o)
+    o_attn = softmax(q(o) k(o)^T / sqrt(D/H)) v(o)             in each of H heads
     z = LayerNorm(f_phi(sum_{i=1..K+1} o_attn_i))
 
 The goal joins the K objects as token K+1, and every token attends to every token: (K+1)^2 weights
@@ -8,8 +8,7 @@ per head. As in the paper's equations there is no output projection and no resid
 
 Shapes: objects (B, K, D), goal (B, D), present (B, K) bool -> z (B, Z).
         B batch, K objects, D token width (the paper's d), Z width of z (its d_z), H heads.
-        The softmax divides by the square root of a head's width D / H, as is usual; the paper's
-        equation, for one head, by that of D.
+        The paper's equation is for one head, so it divides by sqrt(D).
 Run:    python attn.py
 """
 import math

@@ -7,9 +7,10 @@
     python evaluate.py RUN --gif push.gif --distractors 9    a film of one episode
 
 Episode j starts from the same seed at every N and for every agent: goal and target cube stand in
-the same places, only the distractors differ (and a lifting goal's height, which is drawn after
-them). The seeds belong to no training run. The paper does not say whether its scores are of sampled
-actions or of the policy's means; CausalWorld's evaluation plays the means, and so do we.
+the same places; the distractors differ, and what is drawn after them: identifiers, the target's row
+and a lifting goal's height. The seeds belong to no training run (but one with --seed 20220131). The
+paper does not say whether its scores are of sampled actions or of the policy's means; CausalWorld's
+evaluation plays the means, and so do we. results/README.md explains the table's columns ("Words").
 """
 import argparse
 import csv
@@ -81,7 +82,7 @@ def start(checkpoint, agent, distractors, seeds):
     return envs, observations, agent.encode(as_batch(observations))
 
 
-@lru_cache
+@lru_cache                               # a worker meets the same episodes again at every N
 def trained_z(path, first, count):
     """z (B, Z) at the start of these episodes at the N of training."""
     checkpoint, agent = load(path)
@@ -96,7 +97,7 @@ def first_look(agent, observations, z, z_trained, has_read_out):
     """Two measures of z at the start of B episodes, lists of B numbers each.
 
     drift        distance from the z of the same episode at the training N, over the mean distance
-                 between different episodes there
+                 between different episodes there; new identifiers move z, too
     read_error   distance (m) from the target cube to where the agent's read-out sees it; NaN if it
                  was trained without one
     """
@@ -111,21 +112,23 @@ def first_look(agent, observations, z, z_trained, has_read_out):
     return drift.tolist(), error.tolist()
 
 
-def actions(agent, observations, noise, sample_actions):
-    """Actions (B, 9): the policy's means, or sampled with one generator of `noise` per episode."""
+def actions(agent, observations, generators, sample_actions):
+    """Actions (B, 9): the policy's means, or sampled with one generator per episode."""
     mean, log_std, _ = agent(as_batch(observations))
     if not sample_actions:
         return mean.numpy()
     std = log_std.exp().numpy()
-    return [m + std * generator.standard_normal(9) for m, generator in zip(mean.numpy(), noise)]
+    return [m + std * generator.standard_normal(9)
+            for m, generator in zip(mean.numpy(), generators)]
 
 
 def to_the_end(agent, envs, observations, seeds, sample_actions):
     """Play every environment until its episode ends; the info of each last step."""
-    noise = [np.random.default_rng(seed) for seed in seeds]
+    generators = [np.random.default_rng(seed) for seed in seeds]
     ends = [None] * len(envs)
     while None in ends:
-        for e, action in enumerate(actions(agent, observations, noise, sample_actions)):
+        chosen = actions(agent, observations, generators, sample_actions)
+        for e, action in enumerate(chosen):
             if ends[e] is None:
                 observations[e], _, _, truncated, info = envs[e].step(action)
                 if truncated:
@@ -147,9 +150,10 @@ def play(path, distractors, first, count, sample_actions):
     ends = to_the_end(agent, envs, observations, seeds, sample_actions)
     for env in envs:
         env.close()
-    return [Episode(info["fractional_success"], info["fractional_success_strict"],
-                    info["truncated_by"] != "time", *rest)
-            for info, *rest in zip(ends, blocked, drift, read_error)]
+    return [Episode(rho=info["fractional_success"], strict=info["fractional_success_strict"],
+                    cut_short=info["truncated_by"] != "time", blocked=is_in_way, drift=moved,
+                    read_error=error)
+            for info, is_in_way, moved, error in zip(ends, blocked, drift, read_error)]
 
 
 # ---- the sweep over N
@@ -161,15 +165,16 @@ def half_width(values):
     return 1.96 * values.std(ddof=1) / np.sqrt(len(values))
 
 
-def mean(values):
+def mean_or_nan(values):
     """Mean of an array; NaN, without a warning, if it is empty."""
     return values.mean() if len(values) else float("nan")
 
 
 def summary(distractors, episodes):
     """One row of zeroshot.csv: means over episodes, with 95 % intervals."""
-    rho, strict, cut_short, blocked, drift, read_error = np.array(episodes, float).T
-    is_clear = blocked == 0
+    column = dict(zip(Episode._fields, np.array(episodes, float).T))
+    rho, strict = column["rho"], column["strict"]
+    is_clear = column["blocked"] == 0
     return {
         "distractors": distractors,
         "episodes": len(episodes),
@@ -178,12 +183,12 @@ def summary(distractors, episodes):
         "ci95": half_width(rho),
         "ci95_strict": half_width(strict),
         "solved": (rho >= SOLVED).mean(),
-        "cut_short": int(cut_short.sum()),
-        "blocked": blocked.mean(),
-        "success_clear": mean(rho[is_clear]),
-        "success_blocked": mean(rho[~is_clear]),
-        "z_drift": drift.mean(),
-        "read_error": read_error.mean(),
+        "cut_short": int(column["cut_short"].sum()),
+        "blocked": column["blocked"].mean(),
+        "success_clear": mean_or_nan(rho[is_clear]),
+        "success_blocked": mean_or_nan(rho[~is_clear]),
+        "z_drift": column["drift"].mean(),
+        "read_error": column["read_error"].mean(),
     }
 
 
@@ -220,11 +225,11 @@ def evaluate(run, distractors, episodes, sample_actions=False):
     firsts = range(0, episodes, CHUNK)
     chunks = [(run, n, first, min(CHUNK, episodes - first), sample_actions)
               for n in distractors for first in firsts]
-    # Ctrl-C is for the main process alone: leaving the pool ends the others.
-    ignore_ctrl_c = signal.signal, (signal.SIGINT, signal.SIG_IGN)
     context = multiprocessing.get_context("spawn")
     rows, begin = [], time.monotonic()
-    with context.Pool(min(os.cpu_count(), len(chunks)), *ignore_ctrl_c) as pool:
+    # Ctrl-C is for the main process alone: leaving the pool ends the others.
+    with context.Pool(min(os.cpu_count(), len(chunks)), initializer=signal.signal,
+                      initargs=(signal.SIGINT, signal.SIG_IGN)) as pool:
         parts = pool.imap(play_chunk, chunks)                  # in order, as they are done
         for n in distractors:
             played = [episode for _ in firsts for episode in next(parts)]
@@ -270,12 +275,12 @@ def check_csv(path):
 
 def play_live(agent, env, episode, sample_actions):
     """Play one evaluation episode; yields the info at the start and after every step."""
-    noise = [np.random.default_rng(episode_seed(episode))]
+    generators = [np.random.default_rng(episode_seed(episode))]
     obs, info = env.reset(seed=episode_seed(episode))
     yield info
     truncated = False
     while not truncated:
-        action, = actions(agent, [obs], noise, sample_actions)
+        action, = actions(agent, [obs], generators, sample_actions)
         obs, _, _, truncated, info = env.step(action)
         yield info
 
@@ -356,6 +361,8 @@ def read_command():
         fail(f"--episodes must be at least 1, got {args.episodes}")
     if args.gif and not os.path.isdir(os.path.dirname(args.gif) or "."):
         fail(f"--gif {args.gif}: there is no folder {os.path.dirname(args.gif)}")
+    if args.save and (args.watch or args.gif):
+        fail("--save is for the table: not together with --watch or --gif")
     return args
 
 

@@ -53,7 +53,7 @@ class LRN(nn.Module):
         super().__init__()
         D, Z = token_dim, z_dim
         self.token_dim = D
-        self.with_goal = relations
+        self.with_goal = relations                             # `relations` is a method here
         self.with_norm = layer_norm
         # g_theta has four layers: self.first, which stands apart (see relations()), and self.g.
         self.first = orthogonal(nn.Linear(2 * D if relations else D, D))

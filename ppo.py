@@ -76,7 +76,8 @@ def as_one_vector(agent):
 
 
 class PPO(nn.Module):
-    """The learner: agent, optimiser and value normaliser. Defaults suit small problems.
+    """The learner: agent, optimiser and value normaliser. Defaults suit small problems such as the
+    example below; train.py sets every one of them (SETTINGS).
 
     A module, so that its state dict holds the agent and the running moments of the returns.
 
@@ -180,22 +181,22 @@ class PPO(nn.Module):
         actions, means, values = [], [], []
         final_observations, episodes = {}, []
         total, length = np.zeros(E), np.zeros(E, int)          # of the episodes under way
-        noise = None
         for t in range(T):
             for key, array in self.arrays.items():
                 array[t] = [observation[key] for observation in current]
             mean, log_std, value = self.agent({key: x[t] for key, x in self.observations.items()})
-            if noise is None:                                  # at t = 0, for all T steps at once
+            if t == 0:                                         # one draw for all T steps
                 noise = torch.randn(T, *mean.shape) * log_std.exp()        # (T, E, A)
             means.append(mean)
             values.append(value)
             actions.append(mean + noise[t])
             for e, action in enumerate(actions[t].numpy()):
-                current[e], rewards[t, e], terminated[t, e], truncated, info = \
-                    self.envs[e].step(action)
+                current[e], reward, terminates, truncated, info = self.envs[e].step(action)
+                rewards[t, e] = reward
+                terminated[t, e] = terminates
                 total[e] += rewards[t, e]
                 length[e] += 1
-                over = terminated[t, e] or truncated
+                over = terminates or truncated
                 if over or t == T - 1:
                     done[t, e] = True
                     final_observations[t, e] = current[e]
@@ -239,17 +240,17 @@ class PPO(nn.Module):
         batch = self.normalized_batch()
         observations = {key: value.flatten(0, 1) for key, value in self.observations.items()}
         count = len(batch["returns"])
-        means = {}
+        totals = {}
         for _ in range(self.epochs):
             for rows in torch.randperm(count).chunk(self.minibatches):
                 part = {key: value[rows] for key, value in batch.items()}
                 obs = {key: value[rows] for key, value in observations.items()}
                 for key, value in self.minibatch_step(obs, part, clip).items():
                     share = value.detach() / (self.epochs * self.minibatches)
-                    means[key] = means.get(key, 0.0) + share
-        means["explained_variance"] = self.explained_variance
-        over_ranks = rank_mean(torch.stack([value.float() for value in means.values()]))
-        return {**dict(zip(means, over_ranks.tolist())), "lr": lr}
+                    totals[key] = totals.get(key, 0.0) + share
+        totals["explained_variance"] = self.explained_variance
+        averages = rank_mean(torch.stack([value.float() for value in totals.values()]))
+        return {**dict(zip(totals, averages.tolist())), "lr": lr}
 
     def normalized_batch(self):
         """The last rollout as (B, ...) tensors with normalised returns and advantages.
@@ -302,6 +303,7 @@ class PPO(nn.Module):
         value_loss = 0.5 * (value - returns).square().mean()
         # H of a Gaussian: sum_j (log sigma_j + log(2 pi e) / 2)
         entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
+        # L = L_policy + c_v L_value - c_e H, and below it + c_a auxiliary
         loss = policy_loss + self.value_coef * value_loss - self.entropy_coef * entropy
 
         auxiliary_loss = torch.zeros(())

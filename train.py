@@ -3,9 +3,10 @@
     python train.py --encoder lrn                          LRN, PushingCube, 2 distractors
     python train.py --encoder attn --task lift --seed 3    in runs/lift-attn-n2-seed3
     python train.py --encoder lrn --resume                 go on, bit for bit as if never stopped
-    python train.py --encoder lrn --paper                  every number as the paper prints it
+    python train.py --encoder lrn --paper                  the paper's numbers, or its sources'
     python train.py --encoder lrn --set z_dim=50 --out runs/z50        any of SETTINGS, by name
-    torchrun --nproc-per-node 2 train.py --encoder lrn     on several processes or machines
+    torchrun --nproc-per-node 2 train.py --encoder lrn     on several machines (on one, a process
+                                                           per core is the default: --ranks)
 
 Data flow: observation -> a small MLP per type -> objects (B, K, D), goal (B, D) -> encoder
            -> z (B, Z) -> heads: mean (B, 9), value (B,)
@@ -57,14 +58,14 @@ SETTINGS = {
     "action_mode": Setting("integrated", "absolute", "targets that stay keep a grip; CW: absolute"),
     "action_scale": Setting(0.1, 0.1, "rad, largest step of an action"),
     "cube_mass": Setting(0.08, 0.02, "kg; CW's picking task"),
-    "finger_friction": Setting(1.0, 0.1, "IsaacGymEnvs; CW: 0.1, with which nothing is held"),
+    "finger_friction": Setting(1.0, 0.1, "IsaacGymEnvs; CW: 0.1, which holds no 0.08 kg"),
     "goal_yaw": Setting(0.0, math.pi / 4, "an axis-aligned goal asks for the position only"),
     "reward_overlap": Setting(100.0, 100.0, "alpha_1 (A.1)"),
     "reward_distance": Setting(5000.0, 250.0, "alpha_2 (A.1): as printed, 2 mm are worth 0.5"),
     "reward_curiosity": Setting(0.0, 10.0, "alpha_3 (A.1): never positive, pays for throwing"),
     "reward_reach": Setting(2500.0, 0.0, "ours: fingertips towards the cube, as CW has it"),
     # PPO
-    "lr": Setting(2e-3, 2.5e-4, "A.2; here the KL of an update stays below 0.1"),
+    "lr": Setting(2e-3, 2.5e-4, "A.2; ours takes fewer frames"),
     "lr_power": Setting(1.0, 1.0, "lr falls as (share of training left) ^ this; A.2: linearly"),
     "clip": Setting(0.2, 0.5, "A.2"),
     "anneal_clip": Setting(False, True, "rlpyt anneals both"),
@@ -80,10 +81,10 @@ SETTINGS = {
     "normalize_values": Setting(True, False, "or large returns drown the policy loss"),
     "auxiliary": Setting(30.0, 0.0, "ours: weight of the read-out loss, see Agent.auxiliary"),
     # The networks
-    "token_dim": Setting(64, 128, "D; not printed; 64 takes half the time of 128"),
+    "token_dim": Setting(64, 128, "D; not printed; 64 takes half the time of our guess"),
     "z_dim": Setting(25, 25, "Z (section 5)"),
-    "hidden": Setting(128, 128, "width of token MLPs and heads; not printed"),
-    "heads": Setting(4, 4, "of ATTN; not printed"),
+    "hidden": Setting(128, 128, "width of token MLPs and heads; not printed: a guess"),
+    "heads": Setting(4, 4, "of ATTN; not printed: a guess"),
     "relations": Setting(True, True, "False: LRN without relations (figure 5)"),
     "layer_norm": Setting(True, True, "False: LRN with a mean instead (figure 5)"),
     "log_std": Setting(-0.7, 0.0, "of the actions, at the start; rlpyt: 0. -1 learns later"),
@@ -228,7 +229,7 @@ def derived_seed(*numbers):
     """One seed from several numbers, such as (run's seed, update, stream).
 
     Sums like seed + update would make seed 1 repeat seed 0 one update later; SeedSequence mixes
-    the numbers so that no two different tuples give related streams.
+    the numbers. (It reads missing ones as 0: compare tuples of one length only.)
     """
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
@@ -251,6 +252,8 @@ def load(path):
             if key not in checkpoint:
                 raise KeyError(key)
         checkpoint["settings"] = {**DEFAULTS, **checkpoint["settings"]}
+        if checkpoint["encoder"] not in ENCODERS:
+            raise ValueError(f"train.ENCODERS has no {checkpoint['encoder']!r}")
         agent = Agent(checkpoint["encoder"], checkpoint["distractors"], checkpoint["settings"])
         agent.load_state_dict(agent_weights(checkpoint["learner"]))
     except Exception as error:           # torch.load raises many kinds; the user needs one line
@@ -350,7 +353,7 @@ class Run:
         """Is it time for a checkpoint?"""
         return time.monotonic() - self.saved_at > self.args.save_minutes * 60
 
-    def write(self, row, elapsed, played):
+    def write(self, row, elapsed, rollout_seconds):
         """Add this update's rows to the CSVs and print its line."""
         row = {"update": self.update, "frames": self.update * self.frames_per_update, **row}
         speed = self.frames_per_update / elapsed
@@ -360,7 +363,7 @@ class Run:
             "frames": row["frames"],
             "seconds": f"{self.seconds:.2f}",
             "frames_per_second": f"{speed:.0f}",
-            "rollout_share": f"{played / elapsed:.3f}",
+            "rollout_share": f"{rollout_seconds / elapsed:.3f}",
         })
         minutes_left = (self.updates - self.update) * elapsed / 60
         print(f"update {self.update}/{self.updates} "
@@ -420,21 +423,24 @@ def reseed(seed, update, rank, count):
     return [derived_seed(seed, update, rank * count + e) for e in range(count)]
 
 
+EPISODE_SUMS = ("episodes", "return", "length", "success_aabb", "success_strict", "solved",
+                "cut_short")
+
+
 def episode_sums(episodes):
-    """Sums over episodes: their number, then the six columns that summarize() turns into means."""
+    """Sums over episodes (7,), in the order of EPISODE_SUMS."""
     rows = [[1.0, episode["return"], episode["length"],
              episode["info"]["fractional_success"], episode["info"]["fractional_success_strict"],
              episode["info"]["fractional_success"] >= SOLVED,
              episode["info"]["truncated_by"] != "time"] for episode in episodes]
-    return torch.tensor(rows or [[0.0] * 7]).sum(dim=0)
+    return torch.tensor(rows or [[0.0] * len(EPISODE_SUMS)]).sum(dim=0)
 
 
 def summarize(sums):
     """Columns of progress.csv about the episodes of all ranks."""
-    count, cut_short = int(sums[0]), int(sums[6])
-    names = ("return", "length", "success_aabb", "success_strict", "solved")
-    means = (sums[1:6] / sums[0]).tolist()
-    return {"episodes": count, **dict(zip(names, means)), "cut_short": cut_short}
+    episodes, *_, cut_short = sums.tolist()                    # these two stay sums
+    means = dict(zip(EPISODE_SUMS, (sums / sums[0]).tolist()))
+    return {**means, "episodes": int(episodes), "cut_short": int(cut_short)}
 
 
 def over_ranks(sums, wants_to_stop):
@@ -451,7 +457,7 @@ def train(args, settings):
     signals = note_signals()
     learner = make_learner(args, settings, ranks)
     run = Run(args, settings, ranks, learner)
-    if args.resume:                      # each rank reads for itself: spawned ones share tensors
+    if args.resume:                      # every rank reads the file: spawn would share the tensors
         run.restore()
     if rank == 0:
         run.open_files()
@@ -460,7 +466,7 @@ def train(args, settings):
         begin = time.monotonic()
         seeds = reseed(args.seed, run.update, rank, len(learner.envs))
         episodes = learner.rollout(seeds)
-        played = time.monotonic() - begin
+        rollout_seconds = time.monotonic() - begin
         try:
             stats = learner.update(left=1 - run.update / run.updates)
         except FloatingPointError as error:                    # on every rank alike
@@ -471,7 +477,7 @@ def train(args, settings):
         run.seconds += elapsed
         if rank == 0:
             std = learner.agent.log_std.exp().mean().item()
-            run.write({**summarize(sums), "std": std, **stats}, elapsed, played)
+            run.write({**summarize(sums), "std": std, **stats}, elapsed, rollout_seconds)
             if stopping or run.update == run.updates or run.is_due():
                 run.save()
     if rank == 0:
@@ -507,7 +513,8 @@ def read_command(argv=None):
         help="environment steps in all "
              f"(default {DEFAULTS['frames']}, lift {LIFT_SETTINGS['frames']})")
     add("--out", metavar="DIR", help="run folder (default runs/TASK-ENCODER-nN-seedS)")
-    add("--paper", action="store_true", help="every number as the paper prints it")
+    add("--paper", action="store_true",
+        help="the paper's numbers; where it prints none, those of its sources")
     add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="change some of SETTINGS")
     add("--resume", action="store_true", help="go on from the run folder's checkpoint")
     add("--overwrite", action="store_true", help="start anew in a folder that holds a run")
@@ -548,17 +555,24 @@ def read_settings(args):
 def refuse_if_without_effect(name, encoder):
     """Settings of one encoder do nothing to another: say so instead of ignoring them."""
     takers = [kind for kind, (_, names) in ENCODERS.items() if name in names]
-    used_by_agent = name == "hidden" or name == "token_dim" and encoder != "mlp"
-    if takers and encoder not in takers and not used_by_agent:
+    if name == "token_dim":                                    # of whatever looks at tokens
+        takers = [kind for kind in ENCODERS if kind != "mlp"]
+    if name == "hidden":                                       # of the heads, too
+        takers = list(ENCODERS)
+    if takers and encoder not in takers:
         fail(f"--set {name}: without effect on {encoder}; it is a setting of {', '.join(takers)}")
 
 
 def read_value(name, text, where):
     """A setting's value from text; it has the type of the default."""
     kind = type(SETTINGS[name].default)
+    if kind is bool:
+        if text not in ("True", "False"):
+            fail(f"{where}: expected True or False")
+        return text == "True"
     try:
-        value = {"True": True, "False": False}[text] if kind is bool else kind(text)
-    except (KeyError, ValueError):
+        value = kind(text)
+    except ValueError:
         fail(f"{where}: expected {name}=<{kind.__name__}>")
     if kind is int and value < 1:
         fail(f"{where}: expected an integer >= 1")

@@ -28,7 +28,8 @@ except ImportError:                      # the same class without it
 CUBE = 0.065                             # edge of a cube, m
 WALL = 0.242                             # inner radius of the arena, m
 WALL_SIDES = 12                          # the round wall is made of so many boxes
-REACH = 0.124                            # inside this radius a finger can get behind a cube, m
+GRASP_RADIUS = 0.124                     # inside it a finger can get behind a cube, m
+OUTSIDE, BELOW, ABOVE = WALL + 0.03, -0.03, 1.0                # beyond them a cube has left, m
 CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multiplies the two in touch
 # A cube's mass and the fingers' friction are arguments, because sources differ. CausalWorld has
 # 0.08 kg (0.02 in its picking task) and 0.1, with which a cube can hardly be held
@@ -43,6 +44,7 @@ HEIGHT = 0.34                            # height at which fingers are mounted, 
 LINK = 0.16                              # length of the middle and the lower link, m
 OFFSET = 0.05945                         # how far a fingertip stands beside the finger's plane, m
 TIP = 0.0095                             # radius of a finger's lower link and tip, m
+TIP_HALF_EDGE = 0.014                    # of the square that a tip at rest keeps free of cubes, m
 LOWER = (-1.57, -1.2, -3.0)              # limits of upper, middle and lower joint, rad
 UPPER = (1.0, 1.57, 3.0)
 REST = (0.0, 0.55, -0.7)                 # at reset, rad: tips hang beside the cubes, 0.045 m high
@@ -72,6 +74,7 @@ FINGER_SCALE = [1.5] * 3 + [10] * 3 + [1] + [POSITION_SCALE] * 3           # q d
 BETA = 0.05                              # exponent of the curiosity term (A.1)
 REWARD_WEIGHTS = {"overlap": 100.0, "distance": 5000.0, "curiosity": 0.0, "reach": 2500.0}
 SOLVED = 0.8                             # fractional success from which a task counts as solved
+TIME, LEFT, DIVERGED = "time", "a cube left the arena", "the physics diverged"     # truncated_by
 
 
 # ---- geometry
@@ -91,7 +94,8 @@ def forward_kinematics(k, q):
 def inverse_kinematics(k, tip):
     """Joint angles (3,) in rad that bring finger k's tip to `tip` (3,) in m.
 
-    ValueError if it is out of reach. Joint limits are not looked at.
+    For scripted grasps (tests, results/grasp.py): no agent uses it. ValueError if the tip is out of
+    reach. Joint limits are not looked at.
     """
     s, c = FINGER_SIN_COS[k]
     x = c * tip[0] + s * tip[1] + BASE
@@ -99,11 +103,11 @@ def inverse_kinematics(k, tip):
     z = tip[2] - HEIGHT
     depth_squared = y * y + z * z - OFFSET ** 2
     depth = -math.sqrt(max(depth_squared, 0.0))
-    reach = math.hypot(x, depth)
-    if depth_squared < 0 or reach > 2 * LINK:
+    length = math.hypot(x, depth)                              # from the middle joint to the tip
+    if depth_squared < 0 or length > 2 * LINK:
         raise ValueError(f"finger {k} cannot reach {tuple(tip)}")
     q0 = math.remainder(math.atan2(depth, -OFFSET) - math.atan2(z, y), 2 * math.pi)
-    q2 = -2 * math.acos(reach / (2 * LINK))
+    q2 = -2 * math.acos(length / (2 * LINK))
     q1 = math.atan2(-x, -depth) - q2 / 2
     return q0, q1, q2
 
@@ -236,7 +240,7 @@ def squares_overlap(a, b):
 
 
 def corners_inside(squares):
-    """(n,) bool: do the corners of squares (n, 4), rows as above, keep off the wall?"""
+    """(n,) bool: do the corners of cubes at x, y, yaw (columns of `squares`) keep off the wall?"""
     quarter = math.pi / 4 + math.pi / 2 * np.arange(4)
     angle = squares[:, 2:3] + quarter                          # (n, 4)
     x = squares[:, :1] + CUBE / math.sqrt(2) * np.cos(angle)
@@ -351,14 +355,14 @@ class TriFingerEnv(Env):
     """
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 25}
 
+    # Without train.py these defaults count; with it SETTINGS, which are the same (tested).
     def __init__(self, task="push", distractors=2, *, episode_steps=125, substeps=5,
                  timestep=0.008, action_mode="integrated", action_scale=0.1, cube_mass=0.08,
                  finger_friction=1.0, goal_yaw=0.0, reward_weights=None, render_mode=None):
         check_arguments(task, distractors, action_mode, reward_weights, render_mode)
-        if episode_steps < 1 or substeps < 1 or not timestep > 0:
-            raise ValueError("episode_steps, substeps and timestep must be positive")
-        if not (action_scale > 0 and cube_mass > 0 and finger_friction > 0):
-            raise ValueError("action_scale, cube_mass and finger_friction must be positive")
+        check_positive(episode_steps=episode_steps, substeps=substeps, timestep=timestep,
+                       action_scale=action_scale, cube_mass=cube_mass,
+                       finger_friction=finger_friction)
         self.task, self.distractors = task, int(distractors)
         self.episode_steps, self.substeps, self.timestep = episode_steps, substeps, timestep
         self.action_mode, self.action_scale = action_mode, action_scale
@@ -367,6 +371,8 @@ class TriFingerEnv(Env):
         self.reward_weights = {**REWARD_WEIGHTS, **(reward_weights or {})}
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1 / (substeps * timestep))}
+        # The state: _joint_targets (9), _q and _dq (9) measured; _poses and _ids of the cubes,
+        # target (index of a cube), goal (its pose); _moment for the reward of the next step.
         self._np_random = np.random.default_rng()              # Gymnasium's name for it
         self._steps = None                                     # None: reset() has to come first
         scale = CUBE_SCALE * (self.distractors + 1) + FINGER_SCALE * 3 + GOAL_SCALE
@@ -472,30 +478,38 @@ class TriFingerEnv(Env):
     def _place(self):
         """Draw poses (x, y, yaw) of goal, target and distractors, in this order: (N+2, 3).
 
-        Goal and target come first, inside REACH, so that their distribution is the same for all N;
-        distractors lie anywhere in the arena. All uniform by area; nothing overlaps, nothing lies
-        on the goal or touches a finger. Where a crowd has jammed (N near 20), distractors are
-        nudged until a gap opens.
+        Goal and target come first, inside GRASP_RADIUS, so that their distribution is the same for
+        all N; distractors lie anywhere in the arena. All uniform by area; nothing overlaps, nothing
+        lies on the goal or touches a finger.
         """
-        fingers = [[*forward_kinematics(k, REST)[:2], 0.0, 0.014] for k in range(3)]
-        placed = fingers.copy()                                # rows: x, y, yaw, half edge
-        fixed = len(fingers) + 2                               # fingers, goal, target stay
-        for _ in range(200000):
-            if len(placed) == fixed + self.distractors:
-                return np.array(placed[len(fingers):])[:, :3]
-            is_goal = len(placed) == len(fingers)
-            radius = REACH if len(placed) < fixed else WALL
-            new = self._draw_squares(radius, self.goal_yaw if is_goal else math.pi / 4)
+        placed = [[*forward_kinematics(k, REST)[:2], 0.0, TIP_HALF_EDGE] for k in range(3)]
+        self._add_square(placed, GRASP_RADIUS, self.goal_yaw)              # the goal
+        self._add_square(placed, GRASP_RADIUS, math.pi / 4)                # the target
+        for _ in range(self.distractors):
+            self._add_square(placed, WALL, math.pi / 4)
+        return np.array(placed[3:])[:, :3]
+
+    def _add_square(self, placed, radius, yaw):
+        """Add a free square to `placed`: rows x, y, yaw, half edge of 3 fingers, goal, target, ...
+
+        Where a crowd has jammed (N near 20), distractors are nudged until a gap opens.
+        """
+        for _ in range(100_000):                               # a few, except in a crowd
+            new = self._draw_squares(radius, yaw)
             free = self._are_free(new, placed)
             if free.any():
                 placed.append(new[free.argmax()])
-            elif len(placed) > fixed:
-                some = int(self._np_random.integers(fixed, len(placed)))
-                moved = placed.pop(some)
-                nudge = self._np_random.normal(size=(64, 4)) * [0.01, 0.01, 0.2, 0.0]
-                new = np.concatenate([moved + nudge, [moved]])             # at worst: back again
-                placed.append(new[self._are_free(new, placed).argmax()])
+                return
+            if len(placed) > 5:                                # only distractors may be moved
+                self._nudge(placed)
         raise ValueError(f"the arena cannot hold {self.distractors + 1} cubes: no free place found")
+
+    def _nudge(self, placed):
+        """Move one of the distractors in `placed` a little, to wherever it is free."""
+        old = placed.pop(int(self._np_random.integers(5, len(placed))))
+        steps = self._np_random.normal(size=(64, 4)) * [0.01, 0.01, 0.2, 0.0]   # m, m, rad
+        new = np.concatenate([old + steps, [old]])             # at worst: back again
+        placed.append(new[self._are_free(new, placed).argmax()])
 
     def _draw_squares(self, radius, yaw, count=64):
         """(count, 4) candidates, uniform in the disc; a yaw within 45 degrees is every yaw."""
@@ -532,8 +546,8 @@ class TriFingerEnv(Env):
         if self.task == "lift":
             height = float(self._np_random.uniform(CUBE / 2, 0.2))
         self._set_goal(goal, height)
-        target, *poses = cubes
-        poses.insert(self.target, target)
+        target_pose, *poses = cubes
+        poses.insert(self.target, target_pose)
         for cube, (x, y, yaw) in zip(self._cubes, poses):
             pb.resetBasePositionAndOrientation(cube, [x, y, CUBE / 2], yaw_quaternion(yaw),
                                                **self._world)
@@ -541,7 +555,7 @@ class TriFingerEnv(Env):
         for finger in self._fingers:
             for j in JOINTS:
                 pb.resetJointState(finger, j, REST[j], 0.0, **self._world)
-        self._targets = list(REST * 3)
+        self._joint_targets = list(REST * 3)
         self._steps = 0
         if self.render_mode:
             self._paint()
@@ -566,14 +580,14 @@ class TriFingerEnv(Env):
         """
         if self._steps is None:
             raise RuntimeError("call reset() before step()")
-        self._targets = self._joint_targets(nine_numbers(action))
+        self._joint_targets = self._targets_after(nine_numbers(action))
         self._drive()
         self._steps += 1
         reason = self._read()
-        if reason == "the physics diverged":
-            return self._diverged(reason)
+        if reason == DIVERGED:
+            return self._diverged()
         if reason is None and self._steps >= self.episode_steps:
-            reason = "time"
+            reason = TIME
         before, self._moment = self._moment, self._measure()
         rewards = self._rewards(before, self._moment)
         info = {"fractional_success": self._moment.rho, "rewards": rewards}
@@ -585,12 +599,12 @@ class TriFingerEnv(Env):
             time.sleep(self.substeps * self.timestep)
         return self._observe(), sum(rewards.values()), False, reason is not None, info
 
-    def _joint_targets(self, action):
-        """Angles (9,) in rad that an action asks the joints for."""
+    def _targets_after(self, action):
+        """Joint targets (9,) in rad that an action asks for."""
         scale = self.action_scale
         if self.action_mode == "integrated":
             # Targets that stay press on: a grip outlives the action that made it.
-            moved = [target + scale * a for target, a in zip(self._targets, action)]
+            moved = [target + scale * a for target, a in zip(self._joint_targets, action)]
             targets = clip(moved, [q - LEAD for q in self._q], [q + LEAD for q in self._q])
         elif self.action_mode == "delta":
             targets = [q + scale * a for q, a in zip(self._q, action)]
@@ -601,7 +615,7 @@ class TriFingerEnv(Env):
 
     def _drive(self):
         """Let the physics run for one action with the joints drawn to their targets."""
-        client, targets = self._client, self._targets
+        client, targets = self._client, self._joint_targets
         for k, finger in enumerate(self._fingers):
             pb.setJointMotorControlArray(finger, JOINTS, pb.POSITION_CONTROL,
                                          targetPositions=targets[3 * k:3 * k + 3],
@@ -624,13 +638,13 @@ class TriFingerEnv(Env):
             if qw < 0:                                         # q and -q are one turn: show one
                 qx, qy, qz, qw = -qx, -qy, -qz, -qw
             rows += (1.0, CUBE, CUBE, CUBE, x, y, z, qx, qy, qz, qw, *linear, *angular, identifier)
-            if not (x * x + y * y < (WALL + 0.03) ** 2 and -0.03 < z < 1.0):
-                reason = "a cube left the arena"
+            if not (x * x + y * y < OUTSIDE ** 2 and BELOW < z < ABOVE):
+                reason = LEFT
         self._cube_rows = rows
         # Full speed of all joints adds up to about 80 rad/s. Written so that NaN fails it.
         if math.isfinite(sum(rows)) and sum(map(abs, self._dq)) < 1000:
             return reason
-        return "the physics diverged"
+        return DIVERGED
 
     def _measure(self):
         """The Moment of what _read() read."""
@@ -646,7 +660,7 @@ class TriFingerEnv(Env):
         """The observation of Table 1 from what _read() read, scaled, in fresh arrays."""
         q, dq = self._q, self._dq
         is_integrated = self.action_mode == "integrated"
-        a, b, c = fingertips(self._targets) if is_integrated else self._moment.tips
+        a, b, c = fingertips(self._joint_targets) if is_integrated else self._moment.tips
         flat = (*self._cube_rows,                              # (N+1) x 18
                 *q[:3], *dq[:3], -1.0, *a,                     # 3 x 10: q dq identifier tip
                 *q[3:6], *dq[3:6], 0.0, *b,
@@ -665,7 +679,7 @@ class TriFingerEnv(Env):
         """Equation 2 (A.1) term by term, weighted; "reach" is ours.
 
             overlap     rho_t
-            distance    d(o_{t-1}, g) - d(o_t, g): pays for moving closer (printed with a minus)
+            distance    d(o_{t-1}, g) - d(o_t, g): pays for moving closer (printed: away)
             curiosity   (1 - rho_t)^beta log(d(o_t, o_{t-1}) + 1e-5)
             reach       ||tips_{t-1} - o_{t-1}|| - ||tips_t - o_t||: pays for tips nearer the cube
         """
@@ -679,11 +693,11 @@ class TriFingerEnv(Env):
             "reach": weights["reach"] * (before.to_tips - now.to_tips),
         }
 
-    def _diverged(self, reason):
+    def _diverged(self):
         """Last step of an episode whose state is no longer numbers: the next reset builds anew."""
         self._steps = None
         info = {"fractional_success": 0.0, "fractional_success_strict": 0.0,
-                "truncated_by": reason, "rewards": dict.fromkeys(self.reward_weights, 0.0)}
+                "truncated_by": DIVERGED, "rewards": dict.fromkeys(self.reward_weights, 0.0)}
         return self._last_observation, 0.0, False, True, info
 
     # ---- pictures
@@ -745,6 +759,13 @@ def check_arguments(task, distractors, action_mode, reward_weights, render_mode)
         raise ValueError(f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}")
     if render_mode == "human" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
         raise ValueError("a window needs a screen, and DISPLAY is not set; 'rgb_array' needs none")
+
+
+def check_positive(**numbers):
+    """ValueError with one line if one of the numbers is not above 0."""
+    for name, number in numbers.items():
+        if not number > 0:
+            raise ValueError(f"{name} must be positive, got {number!r}")
 
 
 def nine_numbers(action):

@@ -55,7 +55,7 @@ def play(env, seed):
         return goal[2], None
     for angles, actions in way:
         for left in range(actions, 0, -1):
-            env.step(np.subtract(angles, env._targets) / left / env.action_scale)
+            env.step(np.subtract(angles, env._joint_targets) / left / env.action_scale)
     truncated = False
     while not truncated:                                       # zero actions keep the grip
         _, _, _, truncated, info = env.step(np.zeros(9))

@@ -2,8 +2,9 @@
 
     python results/search.py
 
-A cell is the mean of the 25 updates (100 000 frames) up to that point, axis-aligned, sampled
-actions, at N = 2; empty if the run had been stopped before.
+"lr" and "std" are the learning rate and the deviation of actions at the start. The other cells are
+means of the 25 updates (100 000 frames) up to that point, axis-aligned, sampled actions, at N = 2;
+empty if the run had been stopped before.
 """
 import csv
 import glob
@@ -14,27 +15,24 @@ POINTS = (0.3, 1.0, 1.6, 2.0, 3.0, 5.0)                        # million frames
 WINDOW = 100_000                                               # frames
 
 
-def curve(path):
-    """[(frames, success)] of a progress.csv."""
-    with open(path, newline="") as file:
-        return [(int(row["frames"]), float(row["success_aabb"])) for row in csv.DictReader(file)]
-
-
-def success_at(points, frames):
+def success_at(rows, frames):
     """Mean success of the WINDOW before `frames` as text; empty if the run is not so long."""
-    if points[-1][0] < frames:
+    if int(rows[-1]["frames"]) < frames:
         return ""
-    values = [success for at, success in points if frames - WINDOW < at <= frames]
+    values = [float(row["success_aabb"]) for row in rows
+              if frames - WINDOW < int(row["frames"]) <= frames]
     return f"{sum(values) / len(values):.2f}"
 
 
 def main():
-    print("| run | " + " | ".join(f"{point} M" for point in POINTS) + " |")
-    print("|---" * (1 + len(POINTS)) + "|")
+    print("| run | lr | std | " + " | ".join(f"{point} M" for point in POINTS) + " |")
+    print("|---" * (3 + len(POINTS)) + "|")
     for path in sorted(glob.glob(os.path.join(HERE, "search", "*.csv"))):
-        points = curve(path)
-        cells = [success_at(points, point * 1e6) for point in POINTS]
-        print(f"| {os.path.basename(path)[:-4]} | " + " | ".join(cells) + " |")
+        with open(path, newline="") as file:
+            rows = list(csv.DictReader(file))
+        start = f"{float(rows[0]['lr']):.1e}", f"{float(rows[0]['std']):.2f}"
+        cells = [success_at(rows, point * 1e6) for point in POINTS]
+        print(f"| {os.path.basename(path)[:-4]} | " + " | ".join([*start, *cells]) + " |")
 
 
 if __name__ == "__main__":
