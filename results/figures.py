@@ -149,10 +149,12 @@ def over_tables(tables, measure):
 # ---- tables
 
 def cell_text(cell):
-    """'0.80 ± 0.25' and, for several seeds, each of them on a second line. Two seeds have no
-    interval: Student's t makes it longer than the scale."""
+    """'0.80 ± 0.25' and, for several seeds, each of them on a second line.
+
+    Without an interval if it would be longer than the scale, as Student's t often makes it.
+    """
     text = f"{cell.values.mean():.2f}"
-    if len(cell.values) != 2:
+    if cell.half < 0.5:
         text += f" ± {cell.half:.2f}"
     if len(cell.values) > 1:
         text += "<br>" + ", ".join(f"{value:.2f}" for value in cell.values)
