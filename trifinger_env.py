@@ -360,8 +360,9 @@ class TriFingerEnv(Env):
                  timestep=0.008, action_mode="integrated", action_scale=0.1, cube_mass=0.08,
                  finger_friction=1.0, goal_yaw=0.0, reward_weights=None, render_mode=None):
         check_arguments(task, distractors, action_mode, reward_weights, render_mode)
-        check_positive(episode_steps=episode_steps, substeps=substeps, timestep=timestep,
-                       action_scale=action_scale, cube_mass=cube_mass,
+        if episode_steps < 1 or substeps < 1:
+            raise ValueError("episode_steps and substeps must be positive integers")
+        check_positive(timestep=timestep, action_scale=action_scale, cube_mass=cube_mass,
                        finger_friction=finger_friction)
         self.task, self.distractors = task, int(distractors)
         self.episode_steps, self.substeps, self.timestep = episode_steps, substeps, timestep
