@@ -26,7 +26,7 @@ import pybullet
 import torch
 
 from train import derived_seed, fail, load, make_env
-from trifinger_env import CUBE, IDENTIFIER, POSITION, POSITION_SCALE, SOLVED
+from trifinger_env import CUBE, IDENTIFIER, POSITION, POSITION_SCALE, SOLVED, TIME
 
 COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict",
            "solved", "cut_short", "blocked", "success_clear", "success_blocked", "z_drift",
@@ -151,7 +151,7 @@ def play(path, distractors, first, count, sample_actions):
     for env in envs:
         env.close()
     return [Episode(rho=info["fractional_success"], strict=info["fractional_success_strict"],
-                    cut_short=info["truncated_by"] != "time", blocked=is_in_way, drift=moved,
+                    cut_short=info["truncated_by"] != TIME, blocked=is_in_way, drift=moved,
                     read_error=error)
             for info, is_in_way, moved, error in zip(ends, blocked, drift, read_error)]
 

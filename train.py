@@ -34,7 +34,7 @@ from attn import ATTN
 from lrn import LRN, LRNMax
 from ppo import PPO
 from rn import RN
-from trifinger_env import (FINGERTIP, IDENTIFIER, IDENTIFIERS, LINEAR, POSITION, SOLVED,
+from trifinger_env import (FINGERTIP, IDENTIFIER, IDENTIFIERS, LINEAR, POSITION, SOLVED, TIME,
                            TriFingerEnv)
 
 
@@ -432,7 +432,7 @@ def episode_sums(episodes):
     rows = [[1.0, episode["return"], episode["length"],
              episode["info"]["fractional_success"], episode["info"]["fractional_success_strict"],
              episode["info"]["fractional_success"] >= SOLVED,
-             episode["info"]["truncated_by"] != "time"] for episode in episodes]
+             episode["info"]["truncated_by"] != TIME] for episode in episodes]
     return torch.tensor(rows or [[0.0] * len(EPISODE_SUMS)]).sum(dim=0)
 
 

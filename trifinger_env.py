@@ -36,6 +36,7 @@ CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multipli
 # (results/grasp.py); trifinger_simulation 0.08 kg and 0.5; IsaacGymEnvs 0.08 kg and 1.0, as we do.
 # A real cube weighs 0.094 kg.
 IDENTIFIERS = np.linspace(-1.0, 1.0, 21)                       # pool: none is new when N grows
+FIXED = 5                                # squares never nudged: three fingers, goal, target
 
 # The robot: three fingers of three joints each, upper, middle and lower
 JOINTS = (0, 1, 2)
@@ -501,13 +502,13 @@ class TriFingerEnv(Env):
             if free.any():
                 placed.append(new[free.argmax()])
                 return
-            if len(placed) > 5:                                # only distractors may be moved
+            if len(placed) > FIXED:
                 self._nudge(placed)
         raise ValueError(f"the arena cannot hold {self.distractors + 1} cubes: no free place found")
 
     def _nudge(self, placed):
         """Move one of the distractors in `placed` a little, to wherever it is free."""
-        old = placed.pop(int(self._np_random.integers(5, len(placed))))
+        old = placed.pop(int(self._np_random.integers(FIXED, len(placed))))
         steps = self._np_random.normal(size=(64, 4)) * [0.01, 0.01, 0.2, 0.0]   # m, m, rad
         new = np.concatenate([old + steps, [old]])             # at worst: back again
         placed.append(new[self._are_free(new, placed).argmax()])
