@@ -2270,9 +2270,6 @@ def test_columns_about_episodes_by_hand():
     assert train.summarize(sums) == pytest.approx(expected)
     nothing = train.summarize(train.episode_sums([]))
     assert nothing["episodes"] == 0 and math.isnan(nothing["return"])
-    added, stops = train.over_ranks(sums, True)                # one rank: nothing to add
-    assert torch.equal(added, sums) and stops is True
-    assert train.over_ranks(sums, False)[1] is False
 
 
 def test_a_checkpoint_is_due_after_its_minutes(monkeypatch):
@@ -2465,6 +2462,47 @@ def test_stopped_killed_and_resumed_equals_never_stopped(ranks, tmp_path):
     for key, value in expected["learner"].items():
         assert torch.equal(value, ours["learner"][key]), key
     assert read(whole / "progress.csv") == read(cut / "progress.csv")
+
+
+def test_a_stop_in_the_middle_of_an_update_goes_back_to_its_beginning(
+        tmp_path, capsys, monkeypatch, command):
+    """Weights and moments of Adam have changed by then; what is saved is from before."""
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    words = ["train.py --ranks 1 --frames 800 --distractors 0", *SMALL, "--out"]
+    command(*words, whole)
+    step, calls = train.PPO.minibatch_step, []
+
+    def interrupted(self, *rest):
+        calls.append(rest)
+        if len(calls) == 30:             # 12 minibatches an update: in the middle of the third
+            raise KeyboardInterrupt
+        return step(self, *rest)
+
+    monkeypatch.setattr(train.PPO, "minibatch_step", interrupted)
+    capsys.readouterr()
+    command(*words, cut)
+    assert "stopped after 2 updates" in capsys.readouterr().out
+    assert train.load(str(cut))[0]["frames"] == 400
+    command(*words, cut, "--resume")
+    expected, ours = (torch.load(folder / "checkpoint.pt", weights_only=True)["learner"]
+                      for folder in (whole, cut))
+    assert all(torch.equal(value, ours[key]) for key, value in expected.items())
+    assert read(whole / "progress.csv") == read(cut / "progress.csv")
+
+
+@needs_proc
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_stop_does_not_wait_for_a_long_update(ranks, tmp_path):
+    """Ten minutes and more for a rollout here; it stops within seconds and leaves nobody behind."""
+    out = tmp_path / "run"
+    process = start("train.py", "--ranks", str(ranks), "--out", str(out), "--set", "envs=4",
+                    "steps=500000", "minibatches=4")
+    while not os.path.exists(out / "checkpoint.pt"):           # written as the run begins
+        assert process.poll() is None
+        time.sleep(0.05)
+    time.sleep(0.5)
+    stop(process, ranks)
+    assert train.load(str(out))[0]["update"] == 0
 
 
 def test_resuming_a_finished_run_changes_nothing(trained, tmp_path, command, capsys):
@@ -3684,11 +3722,11 @@ MUTATIONS = {
         ("NOISE_STREAM = 10 ** 6", "NOISE_STREAM = 0",
          "test_every_rank_draws_other_episodes_and_other_noise"),
         ("rank * count + e", "e", "test_every_rank_draws_other_episodes_and_other_noise"),
-        ("reseed(args.seed, run.update, rank,", "reseed(args.seed, run.update, 0,",
+        ("reseed(run.args.seed, run.update, rank,", "reseed(run.args.seed, run.update, 0,",
          "test_first_row_of_two_ranks_is_about_the_episodes_of_both"),
-        ("reseed(args.seed, run.update, rank,", "reseed(args.seed, 0, rank,",
+        ("reseed(run.args.seed, run.update, rank,", "reseed(run.args.seed, 0, rank,",
          "test_every_update_plays_other_episodes_and_is_told_how_much_is_left"),
-        ("reseed(args.seed, run.update, rank,", "reseed(0, run.update, rank,",
+        ("reseed(run.args.seed, run.update, rank,", "reseed(0, run.update, rank,",
          "test_every_update_plays_other_episodes_and_is_told_how_much_is_left"),
         ("        dist.all_reduce(sums)\n", "        pass\n",
          "test_first_row_of_two_ranks_is_about_the_episodes_of_both"),
@@ -3724,10 +3762,16 @@ MUTATIONS = {
          "test_as_many_ranks_as_cores_and_batch_allow"),
         ("[\"fractional_success\"] >= SOLVED", "[\"fractional_success\"] > SOLVED",
          "test_columns_about_episodes_by_hand"),
-        ("[\"truncated_by\"] != \"time\"]", "[\"truncated_by\"] == \"time\"]",
+        ("[\"truncated_by\"] != TIME]", "[\"truncated_by\"] == TIME]",
          "test_columns_about_episodes_by_hand"),
         ("self.args.save_minutes * 60", "self.args.save_minutes * 6",
          "test_a_checkpoint_is_due_after_its_minutes"),
+        ("        run.save(before)\n", "        run.save(run.checkpoint())\n",
+         "test_a_stop_in_the_middle_of_an_update_goes_back_to_its_beginning"),
+        ("copy.deepcopy(run.checkpoint())\n    except", "run.checkpoint()\n    except",
+         "test_a_stop_in_the_middle_of_an_update_goes_back_to_its_beginning"),
+        ("            other.kill()\n", "            pass\n",
+         "test_a_stop_does_not_wait_for_a_long_update"),
         # Files
         ("        self.learner.optimizer.load_state_dict(checkpoint[\"optimizer\"])\n", "",
          "test_stopped_killed_and_resumed_equals_never_stopped"),
@@ -3759,7 +3803,7 @@ MUTATIONS = {
          "test_play_equals_a_plain_loop_over_episodes"),
         ("            if ends[e] is None:\n", "            if True:\n",
          "test_every_environment_is_played_to_its_own_end_and_no_further"),
-        ("info[\"truncated_by\"] != \"time\"", "info[\"truncated_by\"] == \"time\"",
+        ("info[\"truncated_by\"] != TIME", "info[\"truncated_by\"] == TIME",
          "test_an_episode_that_ends_for_another_reason_is_cut_short"),
         ("(z - z_trained).norm(dim=1) / spread", "(z - z_trained).norm(dim=1)",
          "test_drift_and_read_error_by_hand"),

@@ -14,6 +14,7 @@ A run folder holds checkpoint.pt, progress.csv (one row per update) and timing.c
 that depend on the machine).
 """
 import argparse
+import copy
 import csv
 import math
 import os
@@ -321,9 +322,9 @@ class Run:
         self.learner.optimizer.load_state_dict(checkpoint["optimizer"])
         self.update, self.seconds = checkpoint["update"], checkpoint["seconds"]
 
-    def save(self):
-        """Write the checkpoint. The random state of a run is its seed and its update."""
-        save({
+    def checkpoint(self):
+        """All that is needed to go on. The random state of a run is its seed and its update."""
+        return {
             "encoder": self.args.encoder,
             "task": self.args.task,
             "distractors": self.args.distractors,
@@ -335,13 +336,16 @@ class Run:
             "seconds": self.seconds,
             "learner": self.learner.state_dict(),
             "optimizer": self.learner.optimizer.state_dict(),
-        }, self.path("checkpoint.pt"))
+        }
+
+    def save(self, checkpoint):
+        save(checkpoint, self.path("checkpoint.pt"))
         self.saved_at = time.monotonic()
 
     def open_files(self):
         """Make the folder ready: a run can be resumed from its first moment on."""
         if not self.args.resume:
-            self.save()
+            self.save(self.checkpoint())
         keep_rows(self.path("progress.csv"), PROGRESS, self.update)
         keep_rows(self.path("timing.csv"), TIMING, self.update)
         if self.update < self.updates:
@@ -387,21 +391,27 @@ def join_ranks():
     return rank, ranks
 
 
-def leave_ranks(ranks):
-    """Leave together, so that nobody waits for a rank that is gone."""
-    if ranks > 1:
+def leave_ranks(ranks, stopped):
+    """Leave together, so that nobody waits for a rank that is gone; a stop ends the others."""
+    if ranks == 1:
+        return
+    if stopped:
+        for other in mp.active_children():
+            other.kill()
+    else:
         dist.barrier()
         dist.destroy_process_group()
-        sys.stdout.flush()
-        os._exit(0)                      # python's own shutdown may meet gloo's threads and abort
+    sys.stdout.flush()
+    os._exit(0)                          # python's own shutdown may meet gloo's threads and abort
 
 
-def note_signals():
-    """A list that is no longer empty once Ctrl-C or SIGTERM has come."""
-    came = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: came.append(True))
-    return came
+def catch_signals(rank):
+    """Ctrl-C and SIGTERM become a KeyboardInterrupt in rank 0, which ends the run for all."""
+    if rank == 0:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    else:                                # Ctrl-C reaches every process of a terminal
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def make_learner(args, settings, ranks):
@@ -443,48 +453,57 @@ def summarize(sums):
     return {**means, "episodes": int(episodes), "cut_short": int(cut_short)}
 
 
-def over_ranks(sums, wants_to_stop):
-    """Add up `sums` over the ranks; the second result says whether any rank wants to stop."""
-    sums = torch.cat([sums, torch.tensor([float(wants_to_stop)])])
+def one_update(run, rank):
+    """Play a batch, learn from it, and (rank 0) write down what came of it."""
+    learner = run.learner
+    begin = time.monotonic()
+    seeds = reseed(run.args.seed, run.update, rank, len(learner.envs))
+    episodes = learner.rollout(seeds)
+    rollout_seconds = time.monotonic() - begin
+    try:
+        stats = learner.update(left=1 - run.update / run.updates)
+    except FloatingPointError as error:                        # on every rank alike
+        fail(f"update {run.update + 1}: {error}; the last checkpoint stays as it was", status=1)
+    sums = episode_sums(episodes)
     if dist.is_initialized():
         dist.all_reduce(sums)
-    return sums[:-1], bool(sums[-1] > 0)
+    elapsed = time.monotonic() - begin
+    run.update += 1
+    run.seconds += elapsed
+    if rank == 0:
+        std = learner.agent.log_std.exp().mean().item()
+        run.write({**summarize(sums), "std": std, **stats}, elapsed, rollout_seconds)
+        if run.update == run.updates or run.is_due():
+            run.save(run.checkpoint())
 
 
 def train(args, settings):
-    """Train on this rank; returns when all frames are played or a signal asks to stop."""
+    """Train on this rank until all frames are played or a signal stops the run.
+
+    A stop does not wait for the update under way, which can take minutes with --paper: it is given
+    up, and the run is saved as it was before it.
+    """
     rank, ranks = join_ranks()
-    signals = note_signals()
+    catch_signals(rank)
     learner = make_learner(args, settings, ranks)
     run = Run(args, settings, ranks, learner)
     if args.resume:                      # every rank reads the file: spawn would share the tensors
         run.restore()
     if rank == 0:
         run.open_files()
-    stopping = False
-    while run.update < run.updates and not stopping:
-        begin = time.monotonic()
-        seeds = reseed(args.seed, run.update, rank, len(learner.envs))
-        episodes = learner.rollout(seeds)
-        rollout_seconds = time.monotonic() - begin
-        try:
-            stats = learner.update(left=1 - run.update / run.updates)
-        except FloatingPointError as error:                    # on every rank alike
-            fail(f"update {run.update + 1}: {error}; the last checkpoint stays as it was", status=1)
-        sums, stopping = over_ranks(episode_sums(episodes), bool(signals))
-        elapsed = time.monotonic() - begin
-        run.update += 1
-        run.seconds += elapsed
-        if rank == 0:
-            std = learner.agent.log_std.exp().mean().item()
-            run.write({**summarize(sums), "std": std, **stats}, elapsed, rollout_seconds)
-            if stopping or run.update == run.updates or run.is_due():
-                run.save()
+    before = copy.deepcopy(run.checkpoint())
+    stopped = False
+    try:
+        while run.update < run.updates:
+            one_update(run, rank)
+            before = copy.deepcopy(run.checkpoint())
+    except KeyboardInterrupt:
+        run.save(before)
+        stopped = True
     if rank == 0:
-        how = "finished" if run.update == run.updates else "stopped"
-        print(f"{how} after {run.update} updates, {run.seconds / 60:.1f} minutes: "
-              f"{run.path('checkpoint.pt')}")
-    leave_ranks(ranks)
+        print(f"{'stopped' if stopped else 'finished'} after {before['update']} updates, "
+              f"{before['seconds'] / 60:.1f} minutes: {run.path('checkpoint.pt')}")
+    leave_ranks(ranks, stopped)
 
 
 # ---- the command line
@@ -678,7 +697,7 @@ def main():
     os.environ.update(RANK="0", WORLD_SIZE=str(args.ranks), MASTER_ADDR="127.0.0.1",
                       MASTER_PORT=str(port))
     others = mp.start_processes(start_rank, (args, settings), args.ranks - 1, join=False,
-                                start_method="spawn")
+                                daemon=True, start_method="spawn")
     try:
         train(args, settings)
     except RuntimeError as error:        # a rank that is gone breaks the others' connections
