@@ -2752,8 +2752,8 @@ def test_settings_with_an_effect_are_taken(tmp_path):
 
 def test_nothing_is_unpickled_or_downloaded():
     """torch.load with weights_only; nothing is imported that runs code or reaches the network."""
-    known = {"argparse", "csv", "datetime", "functools", "math", "multiprocessing", "os", "signal",
-             "socket", "sys", "tempfile", "time", "typing", "numpy", "torch", "pybullet",
+    known = {"argparse", "copy", "csv", "datetime", "functools", "math", "multiprocessing", "os",
+             "signal", "socket", "sys", "tempfile", "time", "typing", "numpy", "torch", "pybullet",
              "gymnasium", "PIL", "lrn", "rn", "attn", "ppo", "train", "trifinger_env"}
     for name in MODULES:
         for node in ast.walk(ast.parse(read(os.path.join(HERE, name)))):
