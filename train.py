@@ -492,14 +492,13 @@ def train(args, settings):
     if rank == 0:
         run.open_files()
     before = copy.deepcopy(run.checkpoint())
-    stopped = False
     try:
         while run.update < run.updates:
             one_update(run, rank)
             before = copy.deepcopy(run.checkpoint())
     except KeyboardInterrupt:
         run.save(before)
-        stopped = True
+    stopped = before["update"] < run.updates
     if rank == 0:
         print(f"{'stopped' if stopped else 'finished'} after {before['update']} updates, "
               f"{before['seconds'] / 60:.1f} minutes: {run.path('checkpoint.pt')}")
