@@ -1,9 +1,9 @@
 """Where does the time of training go?
 
     python results/profile_training.py                   10 updates of LRN at N = 2, half a minute
-    python results/profile_training.py --updates 1
+    python results/profile_training.py --paper --updates 1      with --paper's settings, minutes
 
-Plays and learns as one rank of a default run does (16 of its 32 environments), with a clock around
+Plays and learns as one of two ranks does (with half of a run's environments), with a clock around
 the physics, env.step, env.reset, rollout() and update(). CPU time, so that what runs beside it
 counts little.
 """
@@ -17,10 +17,9 @@ import torch
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from ppo import PPO
-from train import DEFAULTS, PPO_SETTINGS, Agent, make_env
+from train import PPO_SETTINGS, SETTINGS, Agent, make_env
 from trifinger_env import TriFingerEnv
 
-ENVS = 16
 spent = {}                               # name of a function -> seconds spent in it
 
 
@@ -39,32 +38,40 @@ def put_clock_on(owner, name):
     setattr(owner, name, timed)
 
 
-def train(updates):
-    """Seconds of `updates` updates by function, in `spent`; one more update before warms up."""
+def train(updates, settings):
+    """Train for `updates` updates: seconds by function in `spent`; one more, before, warms up.
+
+    Returns the frames played in them.
+    """
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    envs = [make_env("push", 2, DEFAULTS) for _ in range(ENVS)]
-    options = {name: DEFAULTS[name] for name in PPO_SETTINGS}
-    learner = PPO(Agent("lrn", 2, DEFAULTS), envs, **options)
+    E = settings["envs"] // 2
+    envs = [make_env("push", 2, settings) for _ in range(E)]
+    options = {name: settings[name] for name in PPO_SETTINGS}
+    learner = PPO(Agent("lrn", 2, settings), envs, **options)
     for update in range(updates + 1):
         if update == 1:
             spent.update(dict.fromkeys(spent, 0.0))
-        learner.rollout(range(ENVS * update, ENVS * (update + 1)))
+        learner.rollout(range(E * update, E * (update + 1)))
         learner.update(left=1.0)
     for env in envs:
         env.close()
+    return updates * E * settings["steps"]
 
 
 def main():
     parser = argparse.ArgumentParser(description="Where the time of training goes.")
     parser.add_argument("--updates", type=int, default=10, metavar="U")
+    parser.add_argument("--paper", action="store_true", help="the paper's settings")
     args = parser.parse_args()
+    settings = {name: setting.paper if args.paper else setting.default
+                for name, setting in SETTINGS.items()}
     put_clock_on(pybullet, "stepSimulation")
     put_clock_on(TriFingerEnv, "step")
     put_clock_on(TriFingerEnv, "reset")
     put_clock_on(PPO, "rollout")
     put_clock_on(PPO, "update")
-    train(args.updates)
+    frames = train(args.updates, settings)
     total = spent["rollout"] + spent["update"]
     parts = {
         "bare physics": spent["stepSimulation"],
@@ -73,7 +80,6 @@ def main():
         "policy and bookkeeping": spent["rollout"] - spent["step"] - spent["reset"],
         "update": spent["update"],
     }
-    frames = args.updates * ENVS * DEFAULTS["steps"]
     print(f"{1000 * total / frames:.2f} ms a frame, of which")
     for name, seconds in parts.items():
         print(f"{100 * seconds / total:5.0f} %  {name}")
