@@ -47,8 +47,10 @@ all_runs() {
             for N in 0 1 2; do                                 # MLP of figure 1
                 a_run push mlp $N $seed "" --frames 9000000
             done
+            a_run push lrn-max 9 $seed                         # beyond the paper: 9 in training
         fi
         if [ $seed = 0 ]; then
+            a_run push lrn 9 $seed
             a_run lift lrn 0 $seed
         fi
     done
@@ -80,8 +82,8 @@ one_run() {
         exit 255                                               # xargs starts no other run then
     fi
     numbers=0-9
-    if [[ $name =~ -n2-seed ]]; then
-        numbers=0-9,14,19                                      # figure 3
+    if [[ $name =~ -n[29]-seed ]]; then
+        numbers=0-9,14,19                                      # figure 3, and beyond
     fi
     if [[ $name =~ -mlp-n([0-9]+) ]]; then
         numbers=${BASH_REMATCH[1]}                             # it can play no other N
