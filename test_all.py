@@ -3344,6 +3344,38 @@ def test_recentring_a_run_is_measured_in_other_episodes_and_overwrites_nothing(
             recentre.write_recentred(trained, str(tmp_path / "none"), 2)
 
 
+def test_fewer_shows_the_read_out_every_number_of_cubes_and_the_policy_all(
+        results_scripts, monkeypatch, env):
+    monkeypatch.setattr(train, "Agent", train.Agent)           # restored afterwards
+    import fewer
+
+    agent = train.Agent("lrn", 2, train.DEFAULTS)
+    assert type(agent) is fewer.FewerCubes
+    obs = observations(env, count=2)
+    encode, shown = agent.encode, []
+
+    def spy(seen):
+        shown.append(seen["cubes"])
+        return encode(seen)
+
+    agent.encode = spy
+    torch.manual_seed(0)
+    for _ in range(600):
+        agent.auxiliary(obs)
+    sizes = np.bincount([cubes.shape[1] for cubes in shown], minlength=4)
+    # 13.8: what chi-square with 2 degrees of freedom exceeds once in 1000
+    assert sizes[0] == 0 and np.square(sizes[1:] - 200).sum() / 200 < 13.8
+    places = obs["cubes"][0, :, 4].tolist()
+    alone = [places.index(cubes[0, 0, 4].item()) for cubes in shown if cubes.shape[1] == 1]
+    counts = np.bincount(alone, minlength=3)
+    assert np.square(counts - len(alone) / 3).sum() / (len(alone) / 3) < 13.8
+    for cubes in shown:                                        # nobody twice
+        assert len(set(cubes[0, :, 4].tolist())) == cubes.shape[1]
+    shown.clear()
+    agent(obs)
+    assert torch.equal(shown[0], obs["cubes"])
+
+
 def test_relations_are_told_apart_by_kind(results_scripts):
     """Fingers, target, distractors, whichever cube the target is."""
     import inside
