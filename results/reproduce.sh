@@ -48,6 +48,9 @@ all_runs() {
                 a_run push mlp $N $seed "" --frames 9000000
             done
             a_run push lrn-max 9 $seed                         # beyond the paper: 9 in training
+            for encoder in lrn rn attn; do                     # and results/fewer.py
+                a_run push $encoder 2 $seed fewer
+            done
         fi
         if [ $seed = 0 ]; then
             a_run push lrn 9 $seed
@@ -75,8 +78,12 @@ one_run() {
     if [ -e "runs/$name/checkpoint.pt" ]; then
         resume=--resume
     fi
-    echo "$name: $*" | tee -a "$log"
-    if ! python train.py "$@" --ranks 1 --out "runs/$name" $resume >> "$log" 2>&1 ||
+    program=train.py
+    if [[ $name =~ -fewer- ]]; then
+        program=results/fewer.py
+    fi
+    echo "$name: $program $*" | tee -a "$log"
+    if ! python $program "$@" --ranks 1 --out "runs/$name" $resume >> "$log" 2>&1 ||
             ! tail -n 1 "$log" | grep -q "^finished"; then
         echo "$name: not finished, see $log"
         exit 255                                               # xargs starts no other run then
