@@ -2002,6 +2002,33 @@ def test_read_out_loss_is_the_mean_squared_error_of_the_facts():
     assert loss == pytest.approx(np.square(errors).mean(), rel=1e-5)
 
 
+def test_hidden_cubes_show_the_read_out_every_number_of_cubes_and_the_policy_all(env):
+    agent = train.Agent("lrn", 2, {**train.DEFAULTS, "hide_cubes": True})
+    obs = observations(env, count=2)
+    places = obs["cubes"][0, :, 4].tolist()
+    encode, shown = agent.encode, []
+
+    def spy(seen):
+        shown.append(seen["cubes"])
+        return encode(seen)
+
+    agent.encode = spy
+    torch.manual_seed(0)
+    for _ in range(600):
+        agent.auxiliary(obs)
+    sizes = np.bincount([cubes.shape[1] for cubes in shown], minlength=4)
+    # 13.8: what chi-square with 2 degrees of freedom exceeds once in 1000
+    assert sizes[0] == 0 and np.square(sizes[1:] - 200).sum() / 200 < 13.8
+    alone = [places.index(cubes[0, 0, 4].item()) for cubes in shown if cubes.shape[1] == 1]
+    counts = np.bincount(alone, minlength=3)
+    assert np.square(counts - len(alone) / 3).sum() / (len(alone) / 3) < 13.8
+    for cubes in shown:                                        # nobody twice
+        assert len(set(cubes[0, :, 4].tolist())) == cubes.shape[1]
+    shown.clear()
+    agent(obs)
+    assert torch.equal(shown[0], obs["cubes"])
+
+
 def test_read_out_is_read_from_z(env):
     """The loss of a real agent, from its own z and read-out: its gradient reaches the encoder."""
     agent = train.Agent("lrn", 2, train.DEFAULTS)
@@ -2681,6 +2708,7 @@ BAD_INPUT = {                            # start of the command: ((its end, word
         ("--encoder lrn --set heads=2", "--set heads: without effect on lrn"),
         ("--encoder mlp --set token_dim=32", "--set token_dim: without effect on mlp"),
         ("--encoder mlp --set z_dim=5 heads=2", "--set heads: without effect on mlp"),
+        ("--encoder mlp --set hide_cubes=True", "--set hide_cubes: without effect on mlp"),
     ),
     "train.py --out": (
         ("file", "--out"),
@@ -3285,7 +3313,7 @@ def test_every_shipped_run_has_its_command():
         arguments = words[words.index("--task"):]
         plain, seed = train.read_command(arguments).out.rsplit("-", 1)
         assert name.endswith(f"-{seed}")
-        if "--set" in arguments or "-fewer-" in name:          # a word says what is different
+        if "--set" in arguments:                               # a word says what is different
             assert os.path.join("runs", name).startswith(f"{plain}-")
         else:
             assert os.path.join("runs", name) == f"{plain}-{seed}"
@@ -3342,38 +3370,6 @@ def test_recentring_a_run_is_measured_in_other_episodes_and_overwrites_nothing(
         monkeypatch.setattr(recentre, "load", lambda run: (other, agent))
         with pytest.raises(ValueError, match="needs an lrn agent"):
             recentre.write_recentred(trained, str(tmp_path / "none"), 2)
-
-
-def test_fewer_shows_the_read_out_every_number_of_cubes_and_the_policy_all(
-        results_scripts, monkeypatch, env):
-    monkeypatch.setattr(train, "Agent", train.Agent)           # restored afterwards
-    import fewer
-
-    agent = train.Agent("lrn", 2, train.DEFAULTS)
-    assert type(agent) is fewer.FewerCubes
-    obs = observations(env, count=2)
-    encode, shown = agent.encode, []
-
-    def spy(seen):
-        shown.append(seen["cubes"])
-        return encode(seen)
-
-    agent.encode = spy
-    torch.manual_seed(0)
-    for _ in range(600):
-        agent.auxiliary(obs)
-    sizes = np.bincount([cubes.shape[1] for cubes in shown], minlength=4)
-    # 13.8: what chi-square with 2 degrees of freedom exceeds once in 1000
-    assert sizes[0] == 0 and np.square(sizes[1:] - 200).sum() / 200 < 13.8
-    places = obs["cubes"][0, :, 4].tolist()
-    alone = [places.index(cubes[0, 0, 4].item()) for cubes in shown if cubes.shape[1] == 1]
-    counts = np.bincount(alone, minlength=3)
-    assert np.square(counts - len(alone) / 3).sum() / (len(alone) / 3) < 13.8
-    for cubes in shown:                                        # nobody twice
-        assert len(set(cubes[0, :, 4].tolist())) == cubes.shape[1]
-    shown.clear()
-    agent(obs)
-    assert torch.equal(shown[0], obs["cubes"])
 
 
 def test_relations_are_told_apart_by_kind(results_scripts):
@@ -3737,6 +3733,12 @@ MUTATIONS = {
          "test_read_out_loss_asks_about_fresh_goals_targets_and_identifiers"),
         ("cubes[..., IDENTIFIER] = identifiers", "identifiers = cubes[..., IDENTIFIER]",
          "test_read_out_loss_asks_about_fresh_goals_targets_and_identifiers"),
+        ("order = torch.randperm(total)", "order = torch.arange(total)",
+         "test_hidden_cubes_show_the_read_out_every_number_of_cubes_and_the_policy_all"),
+        ("torch.randint(1, total + 1, ())", "torch.randint(1, total, ())",
+         "test_hidden_cubes_show_the_read_out_every_number_of_cubes_and_the_policy_all"),
+        ("        if self.hide_cubes:\n            total", "        if False:\n            total",
+         "test_hidden_cubes_show_the_read_out_every_number_of_cubes_and_the_policy_all"),
         ("torch.randint(count, (B,))", "torch.zeros(B, dtype=torch.long)",
          "test_read_out_loss_asks_about_fresh_goals_targets_and_identifiers"),
         ("identifiers[rows, target]", "identifiers[:, 0]",

@@ -81,6 +81,7 @@ SETTINGS = {
     "normalize_advantages": Setting(True, False, "rlpyt's default"),
     "normalize_values": Setting(True, False, "or large returns drown the policy loss"),
     "auxiliary": Setting(30.0, 0.0, "ours: weight of the read-out loss, see Agent.auxiliary"),
+    "hide_cubes": Setting(False, False, "True: the read-out loss sees only some of the cubes"),
     # The networks
     "token_dim": Setting(64, 128, "D; not printed; 64 takes half the time of our guess"),
     "z_dim": Setting(25, 25, "Z (section 5)"),
@@ -164,6 +165,7 @@ class Agent(nn.Module):
         super().__init__()
         D, Z, hidden = settings["token_dim"], settings["z_dim"], settings["hidden"]
         self.kind, self.distractors = encoder, distractors
+        self.hide_cubes = settings["hide_cubes"]
         if encoder != "mlp":
             self.cube = mlp(18, hidden, D)
             self.finger = mlp(10, hidden, D)
@@ -200,8 +202,15 @@ class Agent(nn.Module):
         position and the three fingertips; the loss is their mean squared error. A batch holds few
         episodes, so few answers to "which cube is meant?". Hence the question is asked anew: every
         sample gets fresh identifiers, a random cube as target and the goal of another sample.
+
+        With `hide_cubes` a minibatch shows a random part of the N+1 cubes, 1 to all of them, so
+        that z has to tell the same whatever their number. The policy always sees them all.
         """
         cubes, goal = obs["cubes"].clone(), obs["goal"]
+        if self.hide_cubes:
+            total = cubes.shape[1]
+            order = torch.randperm(total)
+            cubes = cubes[:, order[:torch.randint(1, total + 1, ())]]
         B, count = cubes.shape[:2]
         rows, target = torch.arange(B), torch.randint(count, (B,))
         shuffled = torch.rand(B, len(POOL)).argsort(dim=1)
@@ -573,7 +582,7 @@ def read_settings(args):
 def refuse_if_without_effect(name, encoder):
     """Settings of one encoder do nothing to another: say so instead of ignoring them."""
     takers = [kind for kind, (_, names) in ENCODERS.items() if name in names]
-    if name == "token_dim":                                    # of whatever looks at tokens
+    if name in ("token_dim", "hide_cubes"):                    # of whatever looks at tokens
         takers = [kind for kind in ENCODERS if kind != "mlp"]
     if name == "hidden":                                       # of the heads, too
         takers = list(ENCODERS)

@@ -48,8 +48,8 @@ all_runs() {
                 a_run push mlp $N $seed "" --frames 9000000
             done
             a_run push lrn-max 9 $seed                         # beyond the paper: 9 in training
-            for encoder in lrn rn attn; do                     # and results/fewer.py
-                a_run push $encoder 2 $seed fewer
+            for encoder in lrn rn attn; do                     # and a read-out of some of the cubes
+                a_run push $encoder 2 $seed hidecubes --set hide_cubes=True
             done
         fi
         if [ $seed = 0 ]; then
@@ -78,18 +78,14 @@ one_run() {
     if [ -e "runs/$name/checkpoint.pt" ]; then
         resume=--resume
     fi
-    program=train.py
-    if [[ $name =~ -fewer- ]]; then
-        program=results/fewer.py
-    fi
-    echo "$name: $program $*" | tee -a "$log"
-    if ! python $program "$@" --ranks 1 --out "runs/$name" $resume >> "$log" 2>&1 ||
+    echo "$name: $*" | tee -a "$log"
+    if ! python train.py "$@" --ranks 1 --out "runs/$name" $resume >> "$log" 2>&1 ||
             ! tail -n 1 "$log" | grep -q "^finished"; then
         echo "$name: not finished, see $log"
         exit 255                                               # xargs starts no other run then
     fi
     numbers=0-9
-    if [[ $name =~ -n[29]-seed ]]; then
+    if [[ $name =~ -n[29]-(hidecubes-)?seed ]]; then
         numbers=0-9,14,19                                      # figure 3, and beyond
     fi
     if [[ $name =~ -mlp-n([0-9]+) ]]; then
