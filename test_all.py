@@ -2709,6 +2709,7 @@ BAD_INPUT = {                            # start of the command: ((its end, word
         ("--encoder mlp --set token_dim=32", "--set token_dim: without effect on mlp"),
         ("--encoder mlp --set z_dim=5 heads=2", "--set heads: without effect on mlp"),
         ("--encoder mlp --set hide_cubes=True", "--set hide_cubes: without effect on mlp"),
+        ("--set hide_cubes=True auxiliary=0", "hide_cubes: without effect"),
     ),
     "train.py --out": (
         ("file", "--out"),

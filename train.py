@@ -81,7 +81,7 @@ SETTINGS = {
     "normalize_advantages": Setting(True, False, "rlpyt's default"),
     "normalize_values": Setting(True, False, "or large returns drown the policy loss"),
     "auxiliary": Setting(30.0, 0.0, "ours: weight of the read-out loss, see Agent.auxiliary"),
-    "hide_cubes": Setting(False, False, "True: the read-out loss sees only some of the cubes"),
+    "hide_cubes": Setting(False, False, "True: the read-out loss hides some cubes from z"),
     # The networks
     "token_dim": Setting(64, 128, "D; not printed; 64 takes half the time of our guess"),
     "z_dim": Setting(25, 25, "Z (section 5)"),
@@ -203,18 +203,20 @@ class Agent(nn.Module):
         episodes, so few answers to "which cube is meant?". Hence the question is asked anew: every
         sample gets fresh identifiers, a random cube as target and the goal of another sample.
 
-        With `hide_cubes` a minibatch shows a random part of the N+1 cubes, 1 to all of them, so
-        that z has to tell the same whatever their number. The policy always sees them all.
+        With `hide_cubes` the encoder is shown some of the N+1 cubes, in every minibatch others (one
+        to all, each number equally often), and z must hold the same facts. Only here: the policy
+        always gets all of them.
         """
         cubes, goal = obs["cubes"].clone(), obs["goal"]
         if self.hide_cubes:
             total = cubes.shape[1]
-            order = torch.randperm(total)
-            cubes = cubes[:, order[:torch.randint(1, total + 1, ())]]
+            order = torch.randperm(total)                      # the same for the whole minibatch
+            shown = int(torch.randint(1, total + 1, ()))
+            cubes = cubes[:, order[:shown]]
         B, count = cubes.shape[:2]
         rows, target = torch.arange(B), torch.randint(count, (B,))
         shuffled = torch.rand(B, len(POOL)).argsort(dim=1)
-        identifiers = POOL[shuffled[:, :count]]                # (B, N+1), distinct in a row
+        identifiers = POOL[shuffled[:, :count]]                # (B, count), distinct in a row
         goal = goal[torch.randperm(B)]                         # a copy, as indexing makes one
         cubes[..., IDENTIFIER] = identifiers
         goal[:, IDENTIFIER] = identifiers[rows, target]
@@ -574,6 +576,8 @@ def read_settings(args):
             fail(f"--set {item}: no such setting; the names are {', '.join(SETTINGS)}")
         refuse_if_without_effect(name, args.encoder)
         settings[name] = read_value(name, text, f"--set {item}")
+    if settings["hide_cubes"] and not settings["auxiliary"]:
+        fail("hide_cubes: without effect, because the read-out loss has no weight (auxiliary=0)")
     if args.frames is not None:
         settings["frames"] = read_value("frames", str(args.frames), f"--frames {args.frames}")
     return settings

@@ -112,6 +112,8 @@ def main():
             fail(str(error))
         if agent.kind not in ("lrn", "rn", "attn"):
             fail(f"{run}: knows how to reweigh lrn, rn and attn, not {agent.kind}")
+        if agent.kind == "lrn" and not agent.encoder.with_norm:
+            fail(f"{run}: takes a mean of its relations; only sums can be reweighed")
         N = args.distractors
         if N is None:
             N = 2 if agent.distractors == 9 else 9
