@@ -2363,8 +2363,6 @@ def test_adding_an_encoder_of_ones_own_is_one_line(tmp_path, monkeypatch):
     torch.manual_seed(0)
     untrained = train.Agent("mine", 2, checkpoint["settings"])
     assert not torch.equal(agent.encoder.out.weight, untrained.encoder.out.weight)
-    done = run(str(script), "--encoder", "theirs", "--out", out)
-    assert done.returncode == 2 and "theirs" in done.stderr and "Traceback" not in done.stderr
 
 
 # ---------------------------------------------------------------- stopping and resuming
@@ -2394,9 +2392,9 @@ def wait_for_the_end_of(group):
         time.sleep(0.05)
 
 
-def start(*command):
+def start(*command, cwd=HERE, env=None):
     """A command under way, in a process group of its own."""
-    return subprocess.Popen([sys.executable, *command], cwd=HERE, stdout=subprocess.PIPE,
+    return subprocess.Popen([sys.executable, *command], cwd=cwd, env=env, stdout=subprocess.PIPE,
                             stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
@@ -3039,19 +3037,17 @@ def test_evaluation_prints_each_n_as_it_is_done_with_the_time_left(simple, monke
     assert "mean actions" in printed[0] and "60 episodes each" in printed[0]
 
 
-def test_evaluation_leaves_a_run_as_it_is_unless_asked_to_save(trained, tmp_path):
+def test_evaluation_leaves_a_run_as_it_is_unless_asked_to_save(trained, tmp_path, command):
     """Other processes play; --save writes what is printed; other N stay, the same N is replaced."""
     out = tmp_path / "run"
     shutil.copytree(trained, out)
     before = files_below(out)
-    command = ("evaluate.py", str(out), "--episodes", "3")
-    done = run(*command, "--distractors", "0,3")
+    done = run("evaluate.py", str(out), "--episodes", "3", "--distractors", "0,3")
     assert done.returncode == 0 and files_below(out) == before, done.stderr
     printed = [line.split() for line in done.stdout.splitlines()[-2:]]
     assert [line[0] for line in printed] == ["0", "3"]
 
-    done = run(*command, "--distractors", "3", "--save")
-    assert done.returncode == 0, done.stderr
+    command("evaluate.py", out, "--episodes 3 --distractors 3 --save")
     saved, = read_csv(out / "zeroshot.csv")
     assert f"{saved['success_aabb']:.3f}" == printed[1][1] and saved["episodes"] == 3
     alone = evaluate.play(str(out), 3, 0, 3, False)            # in this process: the same numbers
@@ -3130,31 +3126,33 @@ def test_a_film_from_the_command_line(trained, tmp_path, command):
 
 # ---------------------------------------------------------------- results/
 
-@pytest.mark.parametrize("script", ["reweigh.py", "profile_training.py", "encoder_speed.py",
-                                    "grasp.py", "scripted_lift.py", "phases.py", "search.py"])
-def test_scripts_of_results_run(script, trained):
-    arguments = {
-        "reweigh.py": [trained, "--distractors", "1", "--episodes", "2"],
-        "profile_training.py": ["--updates", "1"],
-        "encoder_speed.py": ["--repeats", "1"],
-        "grasp.py": ["--tries", "1"],
-        "scripted_lift.py": ["--episodes", "2"],
-        "phases.py": [trained, "--distractors", "1", "--episodes", "2"],
-        "search.py": [],
-    }
-    words = {
-        "reweigh.py": ["as it is", "distractors reweighed", "lengths: a distractor"],
-        "profile_training.py": ["ms a frame", "bare physics", "update"],
-        "encoder_speed.py": ["LRN: K=12", "RN: K=12", "slope"],
-        "grasp.py": ["0.08 kg | 0.00"],
-        "scripted_lift.py": ["0.00 to 0.20 m | 2 | 1.00"],
-        "phases.py": ["lrn | 1 | 0.00 to 0.20 m | 2"],
-        "search.py": ["| push-first | 2.0e-03 | 0.36 | 0.0"],
-    }
-    done = run(os.path.join("results", script), *arguments[script])
-    assert done.returncode == 0, done.stderr
-    for word in words[script]:
-        assert word in done.stdout
+SCRIPTS = {                              # script: (arguments, words that it prints)
+    "reweigh.py": (["RUN", "--distractors", "1", "--episodes", "2"],
+                   ["as it is", "distractors reweighed", "lengths: a distractor"]),
+    "profile_training.py": (["--updates", "1"], ["ms a frame", "bare physics", "update"]),
+    "encoder_speed.py": (["--repeats", "1"], ["LRN: K=12", "RN: K=12", "slope"]),
+    "grasp.py": (["--tries", "1"], ["0.08 kg | 0.00"]),
+    "scripted_lift.py": (["--episodes", "2"], ["0.00 to 0.20 m | 2 | 1.00"]),
+    "phases.py": (["RUN", "--distractors", "1", "--episodes", "2"],
+                  ["lrn | 1 | 0.00 to 0.20 m | 2"]),
+    "search.py": ([], ["| push-first | 2.0e-03 | 0.36 | 0.0"]),
+}
+
+
+@pytest.fixture(scope="module")
+def scripts(trained):
+    """All of SCRIPTS, started side by side."""
+    return {name: start(os.path.join("results", name),
+                        *(trained if word == "RUN" else word for word in arguments))
+            for name, (arguments, _) in SCRIPTS.items()}
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_scripts_of_results_run(name, scripts):
+    printed, errors = scripts[name].communicate(timeout=300)
+    assert scripts[name].returncode == 0, errors
+    for word in SCRIPTS[name][1]:
+        assert word in printed
 
 
 @pytest.mark.skipif(not SLOW, reason="takes a minute: SLOW=1")
@@ -3408,13 +3406,23 @@ def test_energy_distance_of_a_point_and_of_equal_clouds(results_scripts):
 ALONE = ["lrn.py", "rn.py", "attn.py", "ppo.py", "trifinger_env.py"]
 
 
-@pytest.mark.parametrize("name", ALONE)
-def test_module_works_alone_in_an_empty_folder(name, tmp_path):
-    shutil.copy(os.path.join(HERE, name), tmp_path)
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """Each of ALONE, started in a folder that holds nothing else, all side by side."""
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}        # several fight over busy cores
-    done = run(name, cwd=tmp_path, env=one_thread)
-    assert done.returncode == 0 and len(done.stdout.splitlines()) >= 3, done
-    assert sorted(os.listdir(tmp_path)) in ([name], ["__pycache__", name])
+    folders = {name: tmp_path_factory.mktemp("alone") for name in ALONE}
+    for name, folder in folders.items():
+        shutil.copy(os.path.join(HERE, name), folder)
+    return {name: (folder, start(name, cwd=folder, env=one_thread))
+            for name, folder in folders.items()}
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_module_works_alone_in_an_empty_folder(name, alone):
+    folder, process = alone[name]
+    printed, errors = process.communicate(timeout=300)
+    assert process.returncode == 0 and len(printed.splitlines()) >= 3, errors
+    assert sorted(os.listdir(folder)) in ([name], ["__pycache__", name])
 
 
 def test_importing_prints_nothing():
