@@ -2345,6 +2345,7 @@ def test_adding_an_encoder_of_ones_own_is_one_line(tmp_path, monkeypatch):
     """A script of one's own trains it, on two ranks; the checkpoint is read where it is known."""
     script, out = tmp_path / "own.py", str(tmp_path / "run")
     script.write_text(OWN_ENCODER.format(here=HERE))
+    unknown = start(str(script), "--encoder", "theirs", "--out", str(tmp_path / "theirs"))
     done = run(str(script), "--encoder", "mine", "--ranks", "2", "--frames", "600", "--out", out,
                *SMALL, "z_dim=12")
     assert done.returncode == 0, done.stderr
@@ -2363,6 +2364,8 @@ def test_adding_an_encoder_of_ones_own_is_one_line(tmp_path, monkeypatch):
     torch.manual_seed(0)
     untrained = train.Agent("mine", 2, checkpoint["settings"])
     assert not torch.equal(agent.encoder.out.weight, untrained.encoder.out.weight)
+    _, errors = unknown.communicate(timeout=60)
+    assert unknown.returncode == 2 and "theirs" in errors and "Traceback" not in errors
 
 
 # ---------------------------------------------------------------- stopping and resuming

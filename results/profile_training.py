@@ -17,7 +17,7 @@ import torch
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from ppo import PPO
-from train import PPO_SETTINGS, SETTINGS, Agent, make_env
+from train import PPO_SETTINGS, Agent, make_env, read_command, read_settings
 from trifinger_env import TriFingerEnv
 
 spent = {}                               # name of a function -> seconds spent in it
@@ -64,8 +64,7 @@ def main():
     parser.add_argument("--updates", type=int, default=10, metavar="U")
     parser.add_argument("--paper", action="store_true", help="the paper's settings")
     args = parser.parse_args()
-    settings = {name: setting.paper if args.paper else setting.default
-                for name, setting in SETTINGS.items()}
+    settings = read_settings(read_command(["--paper"] if args.paper else []))
     put_clock_on(pybullet, "stepSimulation")
     put_clock_on(TriFingerEnv, "step")
     put_clock_on(TriFingerEnv, "reset")
