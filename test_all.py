@@ -3203,13 +3203,16 @@ def test_reweighed_pairs_weigh_as_much_as_in_training(results_scripts):
 
 
 def write_run(folder, score, minutes):
-    """A run folder with one evaluated N, as figures.py reads it."""
+    """A run folder with one evaluated N, as figures.py reads it. In training success was 0 for 100
+    updates, then `score` for as many."""
     row = {**dict.fromkeys(evaluate.COLUMNS, 0.0), "distractors": 2, "episodes": 100,
            "success_aabb": score, "ci95": 0.03, "solved": score}
     folder.mkdir()
     lines = [",".join(row), ",".join(map(str, row.values()))]
     (folder / "zeroshot.csv").write_text("\n".join(lines) + "\n")
     (folder / "timing.csv").write_text(f"frames,seconds\n6000000,{60 * minutes}\n")
+    lines = [f"{u},{4000 * u},{score * (u > 100)}" for u in range(1, 201)]
+    (folder / "progress.csv").write_text("\n".join(["update,frames,success_aabb", *lines]) + "\n")
     return str(folder)
 
 
@@ -3221,13 +3224,12 @@ def test_table_puts_seeds_together(tmp_path, results_scripts):
     mlp = write_run(tmp_path / "push-mlp-n2-seed0", 0.5, 30)
     aligned = figures.table([*lrn, mlp], "success_aabb")
     solved = figures.table([*lrn, mlp], "solved")
-    assert aligned[0] == "| axis-aligned | seeds | million frames | minutes | N = 2 |"
+    assert aligned[0] == "| axis-aligned | N = 2 |"
     # Student's t with 2 degrees of freedom: 4.303 * 0.1 / sqrt(3)
-    assert aligned[2] == ("| push-lrn-n2 | 3 | 6.0 | 30, 31, 32 | "
-                          "0.80 ± 0.25<br>0.90, 0.70, 0.80 |")
-    assert aligned[3] == "| push-mlp-n2 | 1 | 6.0 | 30 | 0.50 ± 0.03 |"
+    assert aligned[2] == "| push-lrn-n2 | 0.80 ± 0.25<br>0.90, 0.70, 0.80 |"
+    assert aligned[3] == "| push-mlp-n2 | 0.50 ± 0.03 |"
     two = figures.table(lrn[:2], "success_aabb")
-    assert two[2] == "| push-lrn-n2 | 2 | 6.0 | 30, 31 | 0.80<br>0.90, 0.70 |"
+    assert two[2] == "| push-lrn-n2 | 0.80<br>0.90, 0.70 |"
     assert solved[0].startswith("| solved |")
     assert solved[3].endswith("| 0.50 ± 0.10 |")               # 1.96 * sqrt(0.5 * 0.5 / 100)
     cell = figures.over_seeds(lrn, "success_aabb")[2]
@@ -3238,19 +3240,32 @@ def test_frames_to_a_threshold_are_those_of_a_mean_over_25_updates(tmp_path, res
     """Success 0 for 100 updates, then 1: a mean of 25 passes 0.5 with the 13th of the latter."""
     import figures
 
-    for name, rows in (("whole", range(1, 201)), ("never", range(1, 101))):
-        lines = [f"{u},{4000 * u},{float(u > 100)}" for u in rows]
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "progress.csv").write_text(
-            "\n".join(["update,frames,success_aabb", *lines]) + "\n")
-    found = figures.frames_to([str(tmp_path / "whole"), str(tmp_path / "never")], 0.5)
-    np.testing.assert_allclose(found, [4000 * 113 / 1e6, np.nan])
+    runs = [write_run(tmp_path / f"push-lrn-n1-seed{seed}", score, 30)
+            for seed, score in enumerate((1.0, 0.7))]
+    np.testing.assert_allclose(figures.frames_to(runs, 0.5), 4000 * np.array([113, 118]) / 1e6)
+    np.testing.assert_allclose(figures.frames_to(runs, 0.8), [4000 * 120 / 1e6, np.nan])
+    assert figures.training_table(runs)[2] == (
+        "| push-lrn-n1 | 0, 1 | 6.0, 6.0 | 30, 30 | 1.00, 0.70 | 0.5, 0.5 | 0.5, never |")
+
+
+def test_every_table_stands_in_the_section_of_its_figure(results_scripts):
+    import figures
+
+    places = {"push-mlp-n2": "Figure 1", "lift-attn-n2": "Figure 3", "push-lrn-max-n2": "Figure 3",
+              "push-rn-n3": "Figure 4", "push-lrn-n2-z100": "Figure 5", "lift-lrn-n0":
+              "Beyond the paper", "push-lrn-max-n9": "Beyond the paper",
+              "push-rn-n2-hidecubes": "Beyond the paper"}
+    for group, title in places.items():
+        assert figures.section_of(f"results/{group}-seed0") == title, group
+    of_figure_5 = {group for lines in figures.ABLATIONS.values() for group in lines}
+    for group in of_figure_5 - {"push-lrn-n2"}:
+        assert figures.section_of(group) == "Figure 5", group
 
 
 def test_figures_are_drawn_and_tables_printed(tmp_path):
     done = run("results/figures.py", "table")
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("| push-lrn-n2 | ") == 3       # one row in each of three tables
+    assert done.stdout.count("| push-lrn-n2 | ") == 4       # one row in each of four tables
     done = run("results/figures.py", "9")
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (optional)")
@@ -3315,7 +3330,7 @@ def test_every_shipped_run_has_its_command():
         arguments = words[words.index("--task"):]
         plain, seed = train.read_command(arguments).out.rsplit("-", 1)
         assert name.endswith(f"-{seed}")
-        if "--set" in arguments:                               # a word says what is different
+        if "--set" in arguments or "--frames" in arguments:    # a word says what is different
             assert os.path.join("runs", name).startswith(f"{plain}-")
         else:
             assert os.path.join("runs", name) == f"{plain}-{seed}"

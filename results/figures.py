@@ -56,6 +56,13 @@ ABLATIONS = {                            # panels of figure 5: title -> {group o
         "push-lrn-n2-curiosity": "with, weight 10",
     },
 }
+SECTIONS = {                             # of the tables -> groups of runs; the first match counts
+    "Figure 1": "-mlp-",
+    "Figure 3": "-n2$",
+    "Figure 4": "push-.*-n[013]$",
+    "Figure 5": "-n2-(norelations|mean|z[0-9]+|no(overlap|distance|reach)|curiosity)$",
+    "Beyond the paper": "",
+}
 KINDS = {                                # of relations -> colour, those of the paper's figure 7
     "finger 0": "black",
     "finger 1": "saddlebrown",
@@ -86,18 +93,22 @@ def read(run, name):
 
 
 def shipped_runs():
-    """Run folders in this folder: task by task, encoder by encoder, seed by seed."""
+    """Run folders in this folder: task by task, encoder by encoder, group by group."""
     return [run for task in TASKS for encoder in (*LINES, "mlp")
-            for run in sorted(glob.glob(f"{HERE}/{task}-{encoder}-n[0-9]*-seed?"))]
+            for run in sorted(glob.glob(f"{HERE}/{task}-{encoder}-n[0-9]*-seed?"),
+                              key=lambda path: (group_of(path), path))]
+
+
+def group_of(run):
+    """A run's name without its seed: "push-lrn-n2"."""
+    return re.sub(r"-seed\d+$", "", os.path.basename(os.path.normpath(run)))
 
 
 def by_seed(runs):
     """Runs that differ only in the seed, together: {"push-lrn-n2": [folder, ...]}."""
     groups = {}
     for run in runs:
-        name = os.path.basename(os.path.normpath(run))
-        group = re.sub(r"-seed\d+$", "", name)
-        groups.setdefault(group, []).append(run)
+        groups.setdefault(group_of(run), []).append(run)
     return groups
 
 
@@ -161,14 +172,6 @@ def cell_text(cell):
     return text
 
 
-def cost_texts(runs):
-    """Cells that say what the runs cost: how many, million frames, minutes of each."""
-    timings = [read(run, "timing.csv") for run in runs]
-    frames = np.mean([timing["frames"][-1] for timing in timings]) / 1e6
-    minutes = [f"{timing['seconds'][-1] / 60:.0f}" for timing in timings]
-    return [str(len(runs)), f"{frames:.1f}", ", ".join(minutes)]
-
-
 def line_of(cells):
     return "| " + " | ".join(cells) + " |"
 
@@ -178,18 +181,58 @@ def table(runs, measure):
     groups = by_seed(runs)
     columns = {name: over_seeds(members, measure) for name, members in groups.items()}
     numbers = sorted({n for cells in columns.values() for n in cells})
-    head = [MEASURES[measure], "seeds", "million frames", "minutes"]
-    lines = [line_of(head + [f"N = {n}" for n in numbers]),
-             "|---" * (len(head) + len(numbers)) + "|"]
+    head = [MEASURES[measure], *(f"N = {n}" for n in numbers)]
+    lines = [line_of(head), "|---" * len(head) + "|"]
     for name, cells in columns.items():
-        shown = [cell_text(cells[n]) if n in cells else "-" for n in numbers]
-        lines.append(line_of([name, *cost_texts(groups[name]), *shown]))
+        lines.append(line_of([name, *(cell_text(cells[n]) if n in cells else "-"
+                                      for n in numbers)]))
     return lines
 
 
+def training_table(runs):
+    """Lines of the markdown table of what happened in training, seed by seed.
+
+    Success is a mean of 25 updates, that of the sampled actions: at the end, and after how many
+    million frames it first was 0.5 and 0.8.
+    """
+    head = ["in training", "seeds", "million frames", "minutes", "at the end", "0.5 after",
+            "0.8 after"]
+    lines = [line_of(head), "|---" * len(head) + "|"]
+    for name, members in by_seed(runs).items():
+        timings = [read(run, "timing.csv") for run in members]
+        ends = [training_success(run)[1][-1] for run in members]
+        lines.append(line_of([
+            name,
+            ", ".join(run[-1] for run in members),
+            ", ".join(f"{timing['frames'][-1] / 1e6:.1f}" for timing in timings),
+            ", ".join(f"{timing['seconds'][-1] / 60:.0f}" for timing in timings),
+            ", ".join(f"{end:.2f}" for end in ends),
+            frames_text(frames_to(members, 0.5)),
+            frames_text(frames_to(members, 0.8)),
+        ]))
+    return lines
+
+
+def frames_text(frames):
+    """'1.6, never' of million frames, NaN for never."""
+    return ", ".join("never" if np.isnan(each) else f"{each:.1f}" for each in frames)
+
+
+def section_of(run):
+    """The heading under which a run's rows are printed."""
+    return next(title for title, pattern in SECTIONS.items() if re.search(pattern, group_of(run)))
+
+
 def print_tables(runs):
-    for measure in MEASURES:
-        print("\n".join(table(runs, measure)), end="\n\n")
+    for title in SECTIONS:
+        members = [run for run in runs if section_of(run) == title]
+        if not members:
+            continue
+        tables = [training_table(members), *(table(members, measure) for measure in MEASURES)]
+        print(title)
+        for lines in tables:
+            print("\n" + "\n".join(lines))
+        print()
 
 
 # ---- figures
@@ -253,12 +296,17 @@ def draw_groups(axes, groups, lines):
     axes.legend(loc="lower left", fontsize=8)
 
 
+def training_success(run):
+    """Million frames, and the success in training as a mean of 25 updates."""
+    return smooth(read(run, "progress.csv"), "success_aabb", window=25)
+
+
 def frames_to(runs, threshold):
     """Million frames until training success (mean of 25 updates) reaches a threshold, run by run:
     NaN if it never does."""
     found = []
     for run in runs:
-        frames, success = smooth(read(run, "progress.csv"), "success_aabb", window=25)
+        frames, success = training_success(run)
         reached = np.flatnonzero(success >= threshold)
         found.append(frames[reached[0]] if len(reached) else np.nan)
     return np.array(found)

@@ -45,12 +45,14 @@ all_runs() {
         fi
         if [ $seed -le 1 ]; then
             for N in 0 1 2; do                                 # MLP of figure 1
-                a_run push mlp $N $seed "" --frames 9000000
+                a_run push mlp $N $seed
+                a_run push mlp $N $seed long --frames 9000000
             done
             a_run push lrn-max 9 $seed                         # beyond the paper: 9 in training
             for encoder in lrn rn attn; do                     # and a read-out of some of the cubes
                 a_run push $encoder 2 $seed hidecubes --set hide_cubes=True
             done
+            a_run lift lrn 2 $seed hidecubes --set hide_cubes=True
         fi
         if [ $seed = 0 ]; then
             a_run push lrn 9 $seed
