@@ -31,7 +31,7 @@ from trifinger_env import CUBE, IDENTIFIER, POSITION, POSITION_SCALE, SOLVED, TI
 COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict",
            "solved", "cut_short", "blocked", "success_clear", "success_blocked", "z_drift",
            "read_error")
-CHUNK = 25                               # episodes side by side; fixed, whatever the cores
+CHUNK = 25                               # episodes side by side; another number may change bits
 EVALUATION = 20220131                    # keeps these seeds apart from training's
 
 
@@ -97,12 +97,13 @@ def first_look(agent, observations, z, z_trained, has_read_out):
     """Two measures of z at the start of B episodes, lists of B numbers each.
 
     drift        distance from the z of the same episode at the training N, over the mean distance
-                 between different episodes there; new identifiers move z, too
+                 between different episodes there (NaN if there is one episode only). Identifiers
+                 are drawn after the distractors, so they differ at another N and move z, too
     read_error   distance (m) from the target cube to where the agent's read-out sees it; NaN if it
                  was trained without one
     """
     B = len(observations)
-    spread = torch.cdist(z_trained, z_trained).sum() / max(B * (B - 1), 1)
+    spread = torch.cdist(z_trained, z_trained).sum() / (B * (B - 1))
     drift = (z - z_trained).norm(dim=1) / spread
     if not has_read_out:
         return drift.tolist(), [float("nan")] * B
@@ -112,22 +113,26 @@ def first_look(agent, observations, z, z_trained, has_read_out):
     return drift.tolist(), error.tolist()
 
 
-def actions(agent, observations, generators, sample_actions):
-    """Actions (B, 9): the policy's means, or sampled with one generator per episode."""
+def noise_of(episodes):
+    """One generator of action noise per episode, independent of the one that places the cubes."""
+    return [np.random.default_rng(derived_seed(EVALUATION, episode, 1)) for episode in episodes]
+
+
+def actions(agent, observations, generators=None):
+    """Actions (B, 9): sampled with a generator per episode or, without any, the policy's means."""
     mean, log_std, _ = agent(as_batch(observations))
-    if not sample_actions:
+    if generators is None:
         return mean.numpy()
     std = log_std.exp().numpy()
     return [m + std * generator.standard_normal(9)
             for m, generator in zip(mean.numpy(), generators)]
 
 
-def to_the_end(agent, envs, observations, seeds, sample_actions):
+def to_the_end(agent, envs, observations, generators=None):
     """Play every environment until its episode ends; the info of each last step."""
-    generators = [np.random.default_rng(seed) for seed in seeds]
     ends = [None] * len(envs)
     while None in ends:
-        chosen = actions(agent, observations, generators, sample_actions)
+        chosen = actions(agent, observations, generators)
         for e, action in enumerate(chosen):
             if ends[e] is None:
                 observations[e], _, _, truncated, info = envs[e].step(action)
@@ -141,13 +146,15 @@ def play(path, distractors, first, count, sample_actions):
     """Play episodes first .. first+count-1 of the agent in `path`: a list of Episodes."""
     torch.set_num_threads(1)
     checkpoint, agent = load(path)
-    seeds = [episode_seed(first + e) for e in range(count)]
+    episodes = range(first, first + count)
+    seeds = [episode_seed(episode) for episode in episodes]
     envs, observations, z = start(checkpoint, agent, distractors, seeds)
     has_read_out = checkpoint["settings"]["auxiliary"] > 0
     z_trained = trained_z(path, first, count)
     drift, read_error = first_look(agent, observations, z, z_trained, has_read_out)
     blocked = [is_blocked(obs) for obs in observations]
-    ends = to_the_end(agent, envs, observations, seeds, sample_actions)
+    generators = noise_of(episodes) if sample_actions else None
+    ends = to_the_end(agent, envs, observations, generators)
     for env in envs:
         env.close()
     return [Episode(rho=info["fractional_success"], strict=info["fractional_success_strict"],
@@ -187,7 +194,7 @@ def summary(distractors, episodes):
         "blocked": column["blocked"].mean(),
         "success_clear": mean_or_nan(rho[is_clear]),
         "success_blocked": mean_or_nan(rho[~is_clear]),
-        "z_drift": column["drift"].mean(),
+        "z_drift": mean_or_nan(column["drift"][~np.isnan(column["drift"])]),
         "read_error": column["read_error"].mean(),
     }
 
@@ -275,12 +282,12 @@ def check_csv(path):
 
 def play_live(agent, env, episode, sample_actions):
     """Play one evaluation episode; yields the info at the start and after every step."""
-    generators = [np.random.default_rng(episode_seed(episode))]
+    generators = noise_of([episode]) if sample_actions else None
     obs, info = env.reset(seed=episode_seed(episode))
     yield info
     truncated = False
     while not truncated:
-        action, = actions(agent, [obs], generators, sample_actions)
+        action, = actions(agent, [obs], generators)
         obs, _, _, truncated, info = env.step(action)
         yield info
 

@@ -256,7 +256,8 @@ class PPO(nn.Module):
         """The last rollout as (B, ...) tensors with normalised returns and advantages.
 
         Also updates the running moments. rollout() scaled the values with the old moments; the
-        targets here are normalised with the new ones. An update changes them little.
+        targets here are normalised with the new ones. But for the first few updates they differ
+        little.
         """
         batch = {key: value.flatten(0, 1) for key, value in self.batch.items()}
         returns, advantages = batch["returns"], batch["advantages"]

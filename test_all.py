@@ -2711,6 +2711,7 @@ BAD_INPUT = {                            # start of the command: ((its end, word
         ("--encoder mlp --set z_dim=5 heads=2", "--set heads: without effect on mlp"),
         ("--encoder mlp --set hide_cubes=True", "--set hide_cubes: without effect on mlp"),
         ("--set hide_cubes=True auxiliary=0", "hide_cubes: without effect"),
+        ("--distractors 0 --set hide_cubes=True", "there is one cube only"),
     ),
     "train.py --out": (
         ("file", "--out"),
@@ -2857,7 +2858,8 @@ def slow_play(checkpoint, n, episodes, sample_actions):
     agent, results = Simple(), []
     for episode in episodes:
         seed = int(np.random.SeedSequence([20220131, episode]).generate_state(1)[0])
-        noise = np.random.default_rng(seed)
+        other = np.random.SeedSequence([20220131, episode, 1])
+        noise = np.random.default_rng(int(other.generate_state(1)[0]))
         env = train.make_env("push", n, checkpoint["settings"])
         obs, _ = env.reset(seed=seed)
         truncated = False
@@ -2908,7 +2910,7 @@ def test_every_environment_is_played_to_its_own_end_and_no_further():
     envs = [Ends(3), Ends(1), Ends(5)]
     first = [{"fingers": np.zeros((3, 10), np.float32)} for _ in envs]
     with torch.no_grad():
-        infos = evaluate.to_the_end(Simple(), envs, first, [0, 1, 2], False)
+        infos = evaluate.to_the_end(Simple(), envs, first)
     assert [info["steps"] for info in infos] == [3, 1, 5]
     assert [env.steps for env in envs] == [3, 1, 5]
 
@@ -2945,6 +2947,15 @@ def test_drift_and_read_error_by_hand():
     drift, error = evaluate.first_look(Simple(), first, z, z_trained, True)
     assert drift == pytest.approx([0.0, 2 / 4, 10 / 4])
     assert error == pytest.approx([0.0, 0.3, 0.05], abs=1e-6)
+
+
+def test_a_chunk_of_one_episode_has_no_drift(simple):
+    """Nothing to compare with: NaN, which a mean over more episodes leaves out."""
+    one, = evaluate.play("simple", 0, 0, 1, False)
+    assert math.isnan(one.drift)
+    more = [one._replace(drift=0.25), one, one._replace(drift=0.75)]
+    assert evaluate.summary(0, more)["z_drift"] == 0.5
+    assert math.isnan(evaluate.summary(0, [one])["z_drift"])
 
 
 def test_blocked_ways_by_hand():
@@ -3096,9 +3107,9 @@ def test_watching_plays_the_evaluated_episodes(simple, monkeypatch, capsys):
         assert render_mode == "human"
         return train.make_env(task, distractors, settings)
 
-    expected = slow_play(simple, 2, range(3), sample_actions=False)[:, 0]
+    expected = slow_play(simple, 2, range(3), sample_actions=True)[:, 0]
     monkeypatch.setattr(evaluate, "make_env", make_env)
-    evaluate.watch("simple", 2, 3, False)
+    evaluate.watch("simple", 2, 3, True)
     lines = capsys.readouterr().out.splitlines()[1:]
     assert [line.split()[-1] for line in lines] == [f"{rho:.2f}" for rho in expected]
     assert [line.split(":")[0] for line in lines] == ["episode 0", "episode 1", "episode 2"]
@@ -3338,6 +3349,17 @@ def test_every_shipped_run_has_its_command():
         assert (words[0] == "done") == is_shipped, name
     shipped = [name for name in os.listdir(os.path.join(HERE, "results")) if "-seed" in name]
     assert shipped and set(shipped) <= set(names)
+
+
+def test_reproduce_lists_what_a_pattern_names_and_refuses_unknown_options():
+    def reproduce(*words):
+        return subprocess.run(["bash", "results/reproduce.sh", *words], cwd=HERE,
+                              capture_output=True, text=True)
+
+    before, after = reproduce("--list", "lift-rn"), reproduce("lift-rn", "--list")
+    assert before.stdout == after.stdout and before.stdout.count("\n") == 3
+    refused = reproduce("--help")
+    assert refused.returncode == 2 and len(refused.stderr.splitlines()) == 1
 
 
 def test_a_recentred_lrn_is_the_same_at_its_n_and_ignores_constant_distractors(results_scripts):
@@ -3859,12 +3881,11 @@ MUTATIONS = {
          "test_evaluation_starts_belong_to_no_training_run"),
         ("EVALUATION = 20220131", "EVALUATION = 0",
          "test_evaluation_starts_belong_to_no_training_run"),
-        ("    if not sample_actions:\n", "    if False:\n",
+        ("    if generators is None:\n", "    if False:\n",
          "test_play_equals_a_plain_loop_over_episodes"),
         ("std = log_std.exp().numpy()", "std = log_std.numpy()",
          "test_play_equals_a_plain_loop_over_episodes"),
-        ("[np.random.default_rng(seed) for seed in seeds]",
-         "[np.random.default_rng(0) for seed in seeds]",
+        ("derived_seed(EVALUATION, episode, 1)", "derived_seed(EVALUATION, 0, 1)",
          "test_play_equals_a_plain_loop_over_episodes"),
         ("Episode(rho=info[\"fractional_success\"], strict=info[\"fractional_success_strict\"],",
          "Episode(rho=info[\"fractional_success_strict\"], strict=info[\"fractional_success\"],",
@@ -3875,7 +3896,9 @@ MUTATIONS = {
          "test_an_episode_that_ends_for_another_reason_is_cut_short"),
         ("(z - z_trained).norm(dim=1) / spread", "(z - z_trained).norm(dim=1)",
          "test_drift_and_read_error_by_hand"),
-        ("max(B * (B - 1), 1)", "max(B * B, 1)", "test_drift_and_read_error_by_hand"),
+        (".sum() / (B * (B - 1))", ".sum() / (B * B)", "test_drift_and_read_error_by_hand"),
+        ("mean_or_nan(column[\"drift\"][~np.isnan(column[\"drift\"])])",
+         "column[\"drift\"].mean()", "test_a_chunk_of_one_episode_has_no_drift"),
         ("norm(dim=1) * POSITION_SCALE", "norm(dim=1)", "test_drift_and_read_error_by_hand"),
         ("obs[\"cubes\"][is_target(obs)][0, POSITION]", "obs[\"cubes\"][0, POSITION]",
          "test_drift_and_read_error_by_hand"),
@@ -3905,7 +3928,7 @@ MUTATIONS = {
          "test_sampled_actions_are_saved_apart"),
         ("reset(seed=episode_seed(episode))", "reset(seed=episode)",
          "test_watching_plays_the_evaluated_episodes"),
-        ("default_rng(episode_seed(episode))", "default_rng(episode)",
+        ("noise_of([episode])", "noise_of([0])",
          "test_watching_plays_the_evaluated_episodes"),
         ("if step % every == 0:", "if True:", "test_film_shows_one_episode"),
     ),

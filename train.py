@@ -3,9 +3,9 @@
     python train.py --encoder lrn                          LRN, PushingCube, 2 distractors
     python train.py --encoder attn --task lift --seed 3    in runs/lift-attn-n2-seed3
     python train.py --encoder lrn --resume                 go on, bit for bit as if never stopped
-    python train.py --encoder lrn --paper                  the paper's numbers, or its sources'
+    python train.py --encoder lrn --paper --out runs/paper             the paper's numbers
     python train.py --encoder lrn --set z_dim=50 --out runs/z50        any of SETTINGS, by name
-    torchrun --nproc-per-node 2 train.py --encoder lrn     on several machines (on one, a process
+    torchrun --nproc-per-node 2 train.py --encoder rn      for several machines (on one, a process
                                                            per core is the default: --ranks)
 
 Data flow: observation -> a small MLP per type -> objects (B, K, D), goal (B, D) -> encoder
@@ -35,8 +35,8 @@ from attn import ATTN
 from lrn import LRN, LRNMax
 from ppo import PPO
 from rn import RN
-from trifinger_env import (FINGERTIP, IDENTIFIER, IDENTIFIERS, LINEAR, POSITION, SOLVED, TIME,
-                           TriFingerEnv)
+from trifinger_env import (CUBE_WIDTH, FINGER_WIDTH, FINGERTIP, GOAL_WIDTH, IDENTIFIER,
+                           IDENTIFIERS, LINEAR, POSITION, SOLVED, TIME, TriFingerEnv)
 
 
 class Setting(NamedTuple):
@@ -106,6 +106,7 @@ PROGRESS = ("update", "frames", "episodes", "return", "length", "success_aabb", 
             "policy_loss", "value_loss", "auxiliary_loss", "entropy", "grad_norm", "lr")
 TIMING = ("update", "frames", "seconds", "frames_per_second", "rollout_share")
 POOL = torch.tensor(IDENTIFIERS, dtype=torch.float32)
+FACTS = 3 + 3 + 3 + 9                    # what the read-out reads from z, see Agent.auxiliary
 
 
 # ---- the agent
@@ -129,7 +130,7 @@ class ConcatMLP(nn.Sequential):
     """
 
     def __init__(self, distractors, z_dim, hidden):
-        width = 18 * (distractors + 1) + 3 * 10 + 12           # cubes, fingers, goal
+        width = CUBE_WIDTH * (distractors + 1) + FINGER_WIDTH * 3 + GOAL_WIDTH
         super().__init__(mlp(width, 2 * hidden, 2 * hidden, z_dim), nn.LayerNorm(z_dim))
         self.distractors = distractors
 
@@ -167,15 +168,15 @@ class Agent(nn.Module):
         self.kind, self.distractors = encoder, distractors
         self.hide_cubes = settings["hide_cubes"]
         if encoder != "mlp":
-            self.cube = mlp(18, hidden, D)
-            self.finger = mlp(10, hidden, D)
-            self.goal = mlp(12, hidden, D)
+            self.cube = mlp(CUBE_WIDTH, hidden, D)
+            self.finger = mlp(FINGER_WIDTH, hidden, D)
+            self.goal = mlp(GOAL_WIDTH, hidden, D)
         make, names = ENCODERS[encoder]
         known = {**settings, "distractors": distractors}
         self.encoder = make(**{name: known[name] for name in names})
         self.policy = mlp(Z, hidden, hidden, 9, last_gain=0.01)
         self.value = mlp(Z, hidden, hidden, 1, last_gain=1.0)
-        self.read_out = mlp(Z, hidden, 18)
+        self.read_out = mlp(Z, hidden, FACTS)
         self.log_std = nn.Parameter(torch.full((9,), settings["log_std"]))
 
     def tokens(self, obs):
@@ -198,7 +199,7 @@ class Agent(nn.Module):
     def auxiliary(self, obs):
         """Read-out loss (ours): how well z tells what the task is about, in scaled units.
 
-        A small head reads 18 numbers from z: the target cube's position and velocity, the goal's
+        A small head reads FACTS numbers from z: the target cube's position and velocity, the goal's
         position and the three fingertips; the loss is their mean squared error. A batch holds few
         episodes, so few answers to "which cube is meant?". Hence the question is asked anew: every
         sample gets fresh identifiers, a random cube as target and the goal of another sample.
@@ -221,9 +222,9 @@ class Agent(nn.Module):
         cubes[..., IDENTIFIER] = identifiers
         goal[:, IDENTIFIER] = identifiers[rows, target]
         z = self.encode({"cubes": cubes, "fingers": obs["fingers"], "goal": goal})
-        meant = cubes[rows, target]                            # (B, 18)
-        facts = torch.cat([meant[:, POSITION], meant[:, LINEAR], goal[:, POSITION],    # 3 + 3 + 3
-                           obs["fingers"][..., FINGERTIP].flatten(1)], dim=1)          # + 9 = 18
+        meant = cubes[rows, target]                            # (B, CUBE_WIDTH)
+        tips = obs["fingers"][..., FINGERTIP].flatten(1)       # (B, 9)
+        facts = torch.cat([meant[:, POSITION], meant[:, LINEAR], goal[:, POSITION], tips], dim=1)
         return (self.read_out(z) - facts).square().mean()
 
 
@@ -246,7 +247,7 @@ def derived_seed(*numbers):
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
-NOISE_STREAM = 10 ** 6                   # streams below it are environments, from it on ranks
+NOISE_STREAM = 10 ** 6                   # stream e < 10^6: environment e; 10^6 + r: torch on rank r
 
 
 # ---- files of a run
@@ -578,6 +579,8 @@ def read_settings(args):
         settings[name] = read_value(name, text, f"--set {item}")
     if settings["hide_cubes"] and not settings["auxiliary"]:
         fail("hide_cubes: without effect, because the read-out loss has no weight (auxiliary=0)")
+    if settings["hide_cubes"] and args.distractors == 0:
+        fail("hide_cubes: without effect, because there is one cube only")
     if args.frames is not None:
         settings["frames"] = read_value("frames", str(args.frames), f"--frames {args.frames}")
     return settings

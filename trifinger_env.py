@@ -7,7 +7,7 @@ Gymnasium's signatures, and with gymnasium installed it is a gymnasium.Env.
 
 Shapes: observation {"cubes": (N+1, 18), "fingers": (3, 10), "goal": (12,)} float32 (Table 1),
         action (9,) in [-1, 1].
-Run:    python trifinger_env.py        prints frames/s by N and the share of physics in a step
+Run:    python trifinger_env.py        prints frames/s by N, and step() / bare physics
 """
 import math
 import os
@@ -27,6 +27,7 @@ except ImportError:                      # the same class without it
 # The arena
 CUBE = 0.065                             # edge of a cube, m
 WALL = 0.242                             # inner radius of the arena, m
+GAP = 0.001                              # left free between cubes, and to the wall, at the start, m
 WALL_SIDES = 12                          # the round wall is made of so many boxes
 GRASP_RADIUS = 0.124                     # inside it a finger can get behind a cube, m
 OUTSIDE, BELOW, ABOVE = WALL + 0.03, -0.03, 1.0                # beyond them a cube has left, m
@@ -71,6 +72,7 @@ POSE_SCALE = [1] + [CUBE] * 3 + [POSITION_SCALE] * 3 + [1] * 4             # typ
 CUBE_SCALE = POSE_SCALE + [0.5] * 3 + [10] * 3 + [1]                       # ... v omega id
 GOAL_SCALE = POSE_SCALE + [1]                                              # ... id
 FINGER_SCALE = [1.5] * 3 + [10] * 3 + [1] + [POSITION_SCALE] * 3           # q dq id tip
+CUBE_WIDTH, FINGER_WIDTH, GOAL_WIDTH = len(CUBE_SCALE), len(FINGER_SCALE), len(GOAL_SCALE)
 
 BETA = 0.05                              # exponent of the curiosity term (A.1)
 REWARD_WEIGHTS = {"overlap": 100.0, "distance": 5000.0, "curiosity": 0.0, "reach": 2500.0}
@@ -231,6 +233,7 @@ def squares_overlap(a, b):
     a, b = np.asarray(a)[:, None], np.asarray(b)[None]         # (n, 1, 4), (1, m, 4)
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
     between = b[..., 2] - a[..., 2]
+    # Turned by `between`, a square of half edge h reaches h (|cos| + |sin|) along the other's edge.
     widening = np.abs(np.cos(between)) + np.abs(np.sin(between))
     apart = np.zeros(dx.shape, bool)
     for square, own, other in ((a, a[..., 3], b[..., 3]), (b, b[..., 3], a[..., 3])):
@@ -242,11 +245,11 @@ def squares_overlap(a, b):
 
 def corners_inside(squares):
     """(n,) bool: do the corners of cubes at x, y, yaw (columns of `squares`) keep off the wall?"""
-    quarter = math.pi / 4 + math.pi / 2 * np.arange(4)
+    quarter = math.pi / 4 + math.pi / 2 * np.arange(4)         # corners: CUBE / sqrt(2) from x, y
     angle = squares[:, 2:3] + quarter                          # (n, 4)
     x = squares[:, :1] + CUBE / math.sqrt(2) * np.cos(angle)
     y = squares[:, 1:2] + CUBE / math.sqrt(2) * np.sin(angle)
-    return (np.hypot(x, y) < WALL - 0.001).all(1)
+    return (np.hypot(x, y) < WALL - GAP).all(1)
 
 
 # ---- the robot as an URDF
@@ -380,7 +383,8 @@ class TriFingerEnv(Env):
         scale = CUBE_SCALE * (self.distractors + 1) + FINGER_SCALE * 3 + GOAL_SCALE
         self._scale = 1 / np.array(scale, np.float32)
         if spaces is not None:
-            shapes = {"cubes": (self.distractors + 1, 18), "fingers": (3, 10), "goal": (12,)}
+            shapes = {"cubes": (self.distractors + 1, CUBE_WIDTH),
+                      "fingers": (3, FINGER_WIDTH), "goal": (GOAL_WIDTH,)}
             self.observation_space = spaces.Dict({
                 key: spaces.Box(-np.inf, np.inf, shape, np.float32)
                 for key, shape in shapes.items()})
@@ -518,7 +522,7 @@ class TriFingerEnv(Env):
         u = self._np_random.random((count, 3))
         r = radius * np.sqrt(u[:, 0])                          # uniform by area
         angle = 2 * math.pi * u[:, 1]
-        half = CUBE / 2 + 0.0005
+        half = (CUBE + GAP) / 2
         return np.stack([r * np.cos(angle), r * np.sin(angle), (2 * u[:, 2] - 1) * yaw,
                          np.full(count, half)], axis=1)
 
@@ -626,7 +630,7 @@ class TriFingerEnv(Env):
             pb.stepSimulation(client)
 
     def _read(self):
-        """Read joints and cubes from the simulator. Returns a reason to cut the episode short."""
+        """Read joints and cubes from the simulator. Returns why the episode must end, or None."""
         client, reason = self._client, None
         states = [state for finger in self._fingers
                   for state in pb.getJointStates(finger, JOINTS, client)]
@@ -659,7 +663,10 @@ class TriFingerEnv(Env):
         return Moment(tips, position, aabb_overlap(pose, self.goal), to_goal, to_tips)
 
     def _observe(self):
-        """The observation of Table 1 from what _read() read, scaled, in fresh arrays."""
+        """The observation of Table 1 from what _read() read, scaled, in fresh arrays.
+
+        It is kept: _diverged() shows it again.
+        """
         q, dq = self._q, self._dq
         is_integrated = self.action_mode == "integrated"
         a, b, c = fingertips(self._joint_targets) if is_integrated else self._moment.tips
@@ -671,9 +678,9 @@ class TriFingerEnv(Env):
         flat = np.array(flat, np.float32) * self._scale
         split = len(self._cube_rows)
         self._last_observation = {
-            "cubes": flat[:split].reshape(-1, 18),
-            "fingers": flat[split:-12].reshape(3, 10),
-            "goal": flat[-12:],
+            "cubes": flat[:split].reshape(-1, CUBE_WIDTH),
+            "fingers": flat[split:-GOAL_WIDTH].reshape(3, FINGER_WIDTH),
+            "goal": flat[-GOAL_WIDTH:],
         }
         return self._last_observation
 
@@ -824,9 +831,9 @@ def speed_table(episodes=21, steps=100):
                 reset, spent = timed_episode(env, actions, physics)
                 rows.append((steps / spent, spent / sum(physics), reset / spent * steps))
             env.close()
-            rate, share, resets = np.median(rows, axis=0)
+            rate, ratio, resets = np.median(rows, axis=0)
             print(f"{distractors:4d}  {substeps} x {1000 * timestep:.0f} ms {rate:13.0f} "
-                  f"{share:13.2f} {resets:11.1f}")
+                  f"{ratio:13.2f} {resets:11.1f}")
     pb.stepSimulation = bare
 
 

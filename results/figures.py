@@ -70,6 +70,7 @@ KINDS = {                                # of relations -> colour, those of the 
     "target": "green",
     "distractors": "blue",
 }
+PAPER = ("attn", "rn", "lrn")            # the paper's encoders, in the order of its panels
 WINDOW = 50                              # updates that a point of a training curve averages
 
 
@@ -233,6 +234,8 @@ def print_tables(runs):
         for lines in tables:
             print("\n" + "\n".join(lines))
         print()
+    seconds = sum(read(run, "timing.csv")["seconds"][-1] for run in runs)
+    print(f"{len(runs)} runs, {seconds / 3600:.0f} hours of one core")
 
 
 # ---- figures
@@ -315,21 +318,26 @@ def frames_to(runs, threshold):
 def figure_1(folder):
     """Figure 1, right: frames until training success is 0.5 and 0.8, by the N of training.
 
-    "Never" is within the run's frames (reproduce.sh gives the MLP three times as many).
+    "Never" is within the run's frames. The MLP's long runs are other runs than its short ones, as
+    the learning rate falls to 0 at the end of each.
     """
     plt = pyplot()
     groups = by_seed(shipped_runs())
     need_runs(groups, [f"push-mlp-n{N}" for N in range(3)])
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained", sharey=True)
+    lines = (("MLP, 9 M frames", "push-mlp-n{}-long", "s", RED),
+             ("MLP, 3 M frames", "push-mlp-n{}", "o", YELLOW),
+             ("LRN, 3 M frames", "push-lrn-n{}", "o", BLUE))
     for threshold, panel in zip((0.5, 0.8), axes):
-        for encoder, color, down in (("mlp", RED, 14), ("lrn", BLUE, 28)):
-            label = encoder.upper()
-            for N in range(4):
-                frames = frames_to(groups.get(f"push-{encoder}-n{N}", []), threshold)
-                panel.plot([N] * len(frames), frames, "o", color=color, alpha=0.7,
-                           label=label if N == 0 else None)
-                if np.isnan(frames).any():
-                    panel.annotate(f"{label}: never", (N, 1), (0, -down), color=color, ha="center",
+        for row, (label, name, marker, color) in enumerate(lines):
+            runs = {N: groups.get(name.format(N), []) for N in range(4)}
+            frames = {N: frames_to(runs[N], threshold) for N in runs}
+            places = [N for N in runs for _ in runs[N]]
+            panel.plot(places, np.concatenate(list(frames.values())), marker, color=color,
+                       alpha=0.7, label=label)
+            for N in runs:
+                if np.isnan(frames[N]).any():
+                    panel.annotate("never", (N, 1), (0, -14 * (row + 1)), color=color, ha="center",
                                    xycoords=("data", "axes fraction"), textcoords="offset points")
         panel.set(title=f"PushingCube: frames to reach {threshold}", xlabel="N in training",
                   xticks=range(4), xlim=(-0.5, 3.5))
@@ -366,9 +374,9 @@ def figure_4(folder):
     """Figure 4: zero-shot scores of agents trained at 0, 1, 2 and 3 distractors."""
     plt = pyplot()
     groups = by_seed(shipped_runs())
-    need_runs(groups, [f"push-{encoder}-n{N}" for encoder in LINES for N in (0, 1, 3)])
+    need_runs(groups, [f"push-{encoder}-n{N}" for encoder in PAPER for N in (0, 1, 3)])
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.5), layout="constrained", sharey=True)
-    for encoder, panel in zip(("attn", "rn", "lrn"), axes):
+    for encoder, panel in zip(PAPER, axes):
         draw_groups(panel, groups, {f"push-{encoder}-n{N}": f"trained at {N}" for N in range(4)})
         panel.set(title=LINES[encoder][0])
     axes[0].set(ylabel="fractional success (axis-aligned)")
@@ -394,7 +402,7 @@ def figure_6(folder):
     plt = pyplot()
     dots, drifts = read_text("figure6.csv"), read_text("figure6-drift.csv")
     figure, axes = plt.subplots(2, 2, figsize=(9, 8), layout="constrained")
-    for encoder, panel in zip(("attn", "rn", "lrn"), axes.flat):
+    for encoder, panel in zip(PAPER, axes.flat):
         label, color = LINES[encoder]
         of_it = [row for row in dots if row["encoder"] == encoder]
         places = np.array([[row["x"], row["y"]] for row in of_it], float).reshape(-1, 2)

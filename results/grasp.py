@@ -15,8 +15,8 @@ import sys
 import numpy as np
 import pybullet as pb
 
-sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), ".."))
-from trifinger_env import (CUBE, FINGER_YAW, LOWER, UPPER, TriFingerEnv,  # noqa: E402
+sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+from trifinger_env import (CUBE, FINGER_YAW, LOWER, UPPER, TriFingerEnv,
                            inverse_kinematics, yaw_quaternion)
 
 BEARINGS = [yaw + math.pi for yaw in FINGER_YAW]               # every finger grasps on its own side

@@ -22,11 +22,11 @@ import torch
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path.insert(0, os.path.dirname(HERE))
-import evaluate  # noqa: E402
-from train import fail, load  # noqa: E402
-from trifinger_env import IDENTIFIER  # noqa: E402
+import evaluate
+from figures import KINDS
+from train import fail, load
+from trifinger_env import IDENTIFIER, TIME
 
-KINDS = ("finger 0", "finger 1", "finger 2", "target", "distractors")
 LOOKS = 5                                # moments of an episode that t-SNE gets to see
 POINTS = 5000                            # most points that t-SNE and distances are given
 
@@ -41,16 +41,24 @@ def watch(run, distractors, episodes, look):
     for first in range(0, len(episodes), evaluate.CHUNK):
         seeds = [evaluate.episode_seed(e) for e in episodes[first:first + evaluate.CHUNK]]
         envs, observations, _ = evaluate.start(checkpoint, agent, distractors, seeds)
-        noise = [np.random.default_rng(seed) for seed in seeds]
         steps = []
         for _ in range(checkpoint["settings"]["episode_steps"]):
-            actions = evaluate.actions(agent, observations, noise, sample_actions=False)
-            observations = [env.step(action)[0] for env, action in zip(envs, actions)]
+            actions = evaluate.actions(agent, observations)
+            played = [env.step(action) for env, action in zip(envs, actions)]
+            refuse_if_cut_short(played)
+            observations = [obs for obs, *_ in played]
             steps.append(look(agent, evaluate.as_batch(observations)).numpy())
         seen.append(np.stack(steps))
         for env in envs:
             env.close()
     return np.concatenate(seen, axis=1)
+
+
+def refuse_if_cut_short(played):
+    """ValueError if an episode ended before its time, as its z would be of another length."""
+    for *_, truncated, info in played:
+        if truncated and info["truncated_by"] != TIME:
+            raise ValueError(f"an episode was cut short ({info['truncated_by']})")
 
 
 def z_of(agent, obs):
@@ -132,7 +140,7 @@ def figure_7(episodes):
         r = moments(watch(run, N, episodes, relations_of))     # (n, K, D)
         r = some(r, POINTS // (4 * r.shape[1]))
         rows += list(r.reshape(-1, r.shape[-1]))
-        kinds += [KINDS[min(i, 4)] for i in range(r.shape[1])] * len(r)
+        kinds += [list(KINDS)[min(i, 4)] for i in range(r.shape[1])] * len(r)
     places = plane(np.array(rows))
     write("figure7.csv", ("kind", "x", "y"),
           [(kind, f"{x:.2f}", f"{y:.2f}") for kind, (x, y) in zip(kinds, places)])

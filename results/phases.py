@@ -17,11 +17,11 @@ import sys
 import numpy as np
 import torch
 
-sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), ".."))
-import evaluate  # noqa: E402
-from scripted_lift import bands  # noqa: E402
-from train import fail, load  # noqa: E402
-from trifinger_env import SOLVED  # noqa: E402
+sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+import evaluate
+from scripted_lift import bands
+from train import fail, load
+from trifinger_env import SOLVED
 
 COLUMNS = ("success", "strict", "best", "reached", "raised", "above", "placed", "kept")
 
@@ -64,7 +64,7 @@ def watch(run, distractors, episodes):
         seeds = [evaluate.episode_seed(first + e) for e in range(count)]
         envs, observations, _ = evaluate.start(checkpoint, agent, distractors, seeds)
         watched = [Watched(env) for env in envs]
-        evaluate.to_the_end(agent, watched, observations, seeds, sample_actions=False)
+        evaluate.to_the_end(agent, watched, observations)
         for env in watched:
             heights.append(env.height)
             rows.append([env.row[name] for name in COLUMNS])

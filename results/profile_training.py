@@ -17,7 +17,7 @@ import torch
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from ppo import PPO
-from train import PPO_SETTINGS, Agent, make_env, read_command, read_settings
+from train import make_learner, read_command, read_settings
 from trifinger_env import TriFingerEnv
 
 spent = {}                               # name of a function -> seconds spent in it
@@ -38,25 +38,20 @@ def put_clock_on(owner, name):
     setattr(owner, name, timed)
 
 
-def train(updates, settings):
+def train(updates, learner):
     """Train for `updates` updates: seconds by function in `spent`; one more, before, warms up.
 
     Returns the frames played in them.
     """
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    E = settings["envs"] // 2
-    envs = [make_env("push", 2, settings) for _ in range(E)]
-    options = {name: settings[name] for name in PPO_SETTINGS}
-    learner = PPO(Agent("lrn", 2, settings), envs, **options)
+    E = len(learner.envs)
     for update in range(updates + 1):
         if update == 1:
             spent.update(dict.fromkeys(spent, 0.0))
         learner.rollout(range(E * update, E * (update + 1)))
         learner.update(left=1.0)
-    for env in envs:
+    for env in learner.envs:
         env.close()
-    return updates * E * settings["steps"]
+    return updates * E * learner.steps
 
 
 def main():
@@ -64,13 +59,15 @@ def main():
     parser.add_argument("--updates", type=int, default=10, metavar="U")
     parser.add_argument("--paper", action="store_true", help="the paper's settings")
     args = parser.parse_args()
-    settings = read_settings(read_command(["--paper"] if args.paper else []))
+    command = read_command(["--paper"] if args.paper else [])
+    settings = read_settings(command)
+    torch.set_num_threads(1)
     put_clock_on(pybullet, "stepSimulation")
     put_clock_on(TriFingerEnv, "step")
     put_clock_on(TriFingerEnv, "reset")
     put_clock_on(PPO, "rollout")
     put_clock_on(PPO, "update")
-    frames = train(args.updates, settings)
+    frames = train(args.updates, make_learner(command, settings, ranks=2))
     total = spent["rollout"] + spent["update"]
     parts = {
         "bare physics": spent["stepSimulation"],

@@ -106,15 +106,16 @@ one_run() {
 
 jobs=1
 list=
+pattern=.
 while [ $# -gt 0 ]; do
     case $1 in
         --one) shift; one_run "$@"; exit ;;
         --jobs) jobs=$2; shift 2 ;;
         --list) list=yes; shift ;;
-        *) break ;;
+        -*) echo "reproduce.sh: error: no option $1, only --list and --jobs" >&2; exit 2 ;;
+        *) pattern=$1; shift ;;
     esac
 done
-pattern=${1:-.}
 if [ "$list" ]; then
     all_runs | awk -v pattern="$pattern" '$1 ~ pattern' | while read -r name arguments; do
         printf "%-30s %-24s %s\n" "$name" "$(state_of "$name")" "$arguments"

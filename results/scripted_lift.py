@@ -4,7 +4,7 @@
     python results/scripted_lift.py --episodes 5      a quick look
 
 The fingertips close round the cube, press inwards, and carry it to the goal in a straight line, in
-90 of an episode's 125 actions; zero actions then hold it. Of several ways to take hold of the cube
+75 of an episode's 125 actions; zero actions then hold it. Of several ways to take hold of the cube
 (where on its sides, how high) the script takes the first one that needs no joint beyond its limits.
 """
 import argparse
@@ -13,9 +13,9 @@ import sys
 
 import numpy as np
 
-sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), ".."))
-from grasp import joint_angles  # noqa: E402
-from trifinger_env import CUBE, LOWER, SOLVED, UPPER, TriFingerEnv  # noqa: E402
+sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+from grasp import joint_angles
+from trifinger_env import CUBE, LOWER, SOLVED, UPPER, TriFingerEnv
 
 AROUND, PRESSED = 0.08, CUBE / 2 - 0.02                        # tips' distance from the middle, m
 TURNS = [sign * turn for turn in np.arange(0.0, 0.9, 0.15) for sign in (1, -1)]

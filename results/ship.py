@@ -17,7 +17,7 @@ import sys
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path.insert(0, os.path.dirname(HERE))
-from train import fail, load, save  # noqa: E402
+from train import fail, load, save
 
 ROWS = 300
 LAST = ("update", "frames", "seconds", "lr")
