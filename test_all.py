@@ -3197,6 +3197,21 @@ def test_reweighing_changes_nothing_at_the_n_of_training(kind, results_scripts):
                                    atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.parametrize("kind, layer_norm, reason", [
+    ("lrn-max", True, "knows how to reweigh lrn, rn and attn"),
+    ("lrn", False, "only sums can be reweighed")])
+def test_what_is_no_sum_is_not_reweighed(kind, layer_norm, reason, results_scripts, monkeypatch,
+                                         capsys):
+    import reweigh
+
+    agent = train.Agent(kind, 2, {**train.DEFAULTS, "layer_norm": layer_norm})
+    monkeypatch.setattr(reweigh, "load", lambda run: ({}, agent))
+    monkeypatch.setattr(sys, "argv", ["reweigh.py", "run"])
+    with pytest.raises(SystemExit):
+        reweigh.main()
+    assert reason in capsys.readouterr().err
+
+
 def test_reweighed_pairs_weigh_as_much_as_in_training(results_scripts):
     """Weights of all pairs by kind, summed, do not depend on N: counted by hand."""
     import reweigh

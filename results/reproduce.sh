@@ -55,6 +55,9 @@ all_runs() {
             a_run lift lrn 2 $seed hidecubes --set hide_cubes=True
         fi
         if [ $seed = 0 ]; then
+            for encoder in lrn rn attn; do                     # without our read-out loss
+                a_run push $encoder 2 $seed noreadout --set auxiliary=0
+            done
             a_run push lrn 9 $seed
             a_run lift lrn 0 $seed
         fi
