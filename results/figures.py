@@ -145,13 +145,9 @@ def cell(values, bars):
 
 def over_seeds(runs, measure):
     """{N: Cell} of a measure over runs that differ in the seed alone."""
-    return over_tables([read(run, "zeroshot.csv") for run in runs], measure)
-
-
-def over_tables(tables, measure):
-    """The same of what was read from several zeroshot.csv."""
     values, bars = {}, {}
-    for rows in tables:
+    for run in runs:
+        rows = read(run, "zeroshot.csv")
         for i, n in enumerate(rows["distractors"].astype(int).tolist()):
             values.setdefault(n, []).append(rows[measure][i])
             bars.setdefault(n, []).append(bar_of(rows, i, measure))
@@ -273,15 +269,6 @@ def draw_zero_shot(axes, cells, label, color, marker="o"):
     draw(axes, list(cells), values, label, color, marker)
 
 
-def draw_recentred(axes, task):
-    """LRN after recentre.py: scores in recentred/."""
-    paths = sorted(glob.glob(f"{HERE}/recentred/{task}-lrn-n2-seed?.csv"))
-    if paths:
-        tables = [read(*os.path.split(path)) for path in paths]
-        cells = over_tables(tables, "success_aabb")
-        draw_zero_shot(axes, cells, "LRN, recentred", "#56B4E9", marker="^")
-
-
 def with_seeds(label, runs):
     """A label that says how many runs stand behind the line."""
     return f"{label}, {len(runs)} seed{'s' if len(runs) > 1 else ''}"
@@ -360,7 +347,6 @@ def figure_3(folder):
             curves = [success for _, success in progress]
             draw(left, progress[0][0], curves, with_seeds(label, runs), color)
             draw_zero_shot(right, over_seeds(runs, "success_aabb"), label, color)
-        draw_recentred(right, task)
         left.set(title=f"{TASKS[task]}: training at N = 2", xlabel="million frames",
                  ylabel="fractional success (axis-aligned)", ylim=(0, 1))
         right.set(title=f"{TASKS[task]}: zero-shot", xlabel="N, distractors at test time",
