@@ -3279,7 +3279,7 @@ def test_every_table_stands_in_the_section_of_its_figure(results_scripts):
 
     places = {"push-mlp-n2": "Figure 1", "lift-attn-n2": "Figure 3", "push-lrn-max-n2": "Figure 3",
               "push-rn-n3": "Figure 4", "push-lrn-n2-z100": "Figure 5", "lift-lrn-n0":
-              "Beyond the paper", "push-lrn-max-n9": "Beyond the paper",
+              "Beyond the paper", "push-rn-n2-noreadout": "What we added", "push-lrn-max-n9": "Beyond the paper",
               "push-rn-n2-hidecubes": "Beyond the paper"}
     for group, title in places.items():
         assert figures.section_of(f"results/{group}-seed0") == title, group
