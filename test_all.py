@@ -3150,6 +3150,8 @@ SCRIPTS = {                              # script: (arguments, words that it pri
     "phases.py": (["RUN", "--distractors", "1", "--episodes", "2"],
                   ["lrn | 1 | 0.00 to 0.20 m | 2"]),
     "search.py": ([], ["| push-first | 2.0e-03 | 0.36 | 0.0"]),
+    "recheck.py": (["results/push-lrn-n2-seed2", "--episodes", "2"],
+                   ["push-lrn-n2-seed2 | N = 2 | 0.", "push-lrn-n2-seed2 | N = 9 | 0."]),
 }
 
 
@@ -3260,6 +3262,28 @@ def test_table_puts_seeds_together(tmp_path, results_scripts):
     assert solved[3].endswith("| 0.50 ± 0.10 |")               # 1.96 * sqrt(0.5 * 0.5 / 100)
     cell = figures.over_seeds(lrn, "success_aabb")[2]
     assert abs(cell.bar - 0.03 / 3 ** 0.5) < 1e-12             # mean of three means, each +- 0.03
+
+
+def test_a_recheck_compares_with_the_file_in_other_episodes(tmp_path, results_scripts,
+                                                            monkeypatch, capsys):
+    """0.90 +- 0.03 and 0.94 +- 0.04 differ by 0.04, and that by +- 0.05."""
+    import recheck
+
+    path = write_run(tmp_path / "push-lrn-n2-seed0", 0.9, 30)
+    asked = []
+
+    def play(run, distractors, first, count, sample_actions):
+        asked.extend(range(first, first + count))
+        return [first]
+
+    monkeypatch.setattr(evaluate, "play", play)
+    monkeypatch.setattr(evaluate, "summary",
+                        lambda *_: {"success_aabb": 0.94, "ci95": 0.04})
+    recheck.compare(path, 2, 60)
+    recheck.compare(path, 9, 60)                               # write_run() has N = 2 only
+    line, = capsys.readouterr().out.splitlines()
+    assert line.endswith("| N = 2 | 0.900 +- 0.030 | 0.940 +- 0.040 | 0.80")
+    assert asked == list(range(1000, 1060))
 
 
 def test_frames_to_a_threshold_are_those_of_a_mean_over_25_updates(tmp_path, results_scripts):

@@ -1,0 +1,65 @@
+"""Do scores hold in other episodes? Plays shipped agents again from starts never used before.
+
+    python results/recheck.py                   five runs at random, at N = 2 and 9: ten minutes
+    python results/recheck.py RUN --episodes 50 a run of your choice
+
+Each row: the score (axis-aligned) of zeroshot.csv, from episodes 0 .. 199; that of as many further
+episodes; their difference in units of its own 95 % interval. Beyond 1 lies one in twenty.
+"""
+import argparse
+import os
+import sys
+
+import numpy as np
+
+sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+import evaluate
+from figures import read, shipped_runs
+from train import fail
+
+FIRST = 1000                             # number of the first of the other episodes
+NUMBERS = (2, 9)                         # of distractors
+
+
+def play_others(run, distractors, episodes):
+    """A row of zeroshot.csv from episodes FIRST, FIRST + 1, ..."""
+    played = []
+    for first in range(FIRST, FIRST + episodes, evaluate.CHUNK):
+        count = min(evaluate.CHUNK, FIRST + episodes - first)
+        played += evaluate.play(run, distractors, first, count, sample_actions=False)
+    return evaluate.summary(distractors, played)
+
+
+def compare(run, distractors, episodes):
+    """Print a row; nothing if the run was not played at that N."""
+    table = read(run, "zeroshot.csv")
+    at = np.flatnonzero(table["distractors"] == distractors)
+    if not len(at):
+        return
+    score, bar = table["success_aabb"][at[0]], table["ci95"][at[0]]
+    other = play_others(run, distractors, episodes)
+    interval = np.hypot(bar, other["ci95"])
+    print(f"{os.path.basename(os.path.normpath(run))} | N = {distractors} | "
+          f"{score:.3f} +- {bar:.3f} | {other['success_aabb']:.3f} +- {other['ci95']:.3f} | "
+          f"{abs(other['success_aabb'] - score) / interval:.2f}", flush=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description="Play shipped agents in other episodes (see the first lines of recheck.py).")
+    parser.add_argument("runs", nargs="*", metavar="RUN", help="default: five of the shipped ones")
+    parser.add_argument("--episodes", type=int, default=200, metavar="E", help="default 200")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the choice")
+    args = parser.parse_args()
+    shipped = np.random.default_rng(args.seed).permutation(shipped_runs())
+    print("run | N | in zeroshot.csv | in other episodes | difference / its interval")
+    try:
+        for run in args.runs or shipped[:5]:
+            for distractors in NUMBERS:
+                compare(run, distractors, args.episodes)
+    except ValueError as error:
+        fail(str(error))
+
+
+if __name__ == "__main__":
+    main()
