@@ -106,8 +106,8 @@ class LRN(nn.Module):
 class LRNMax(LRN):
     """Not the paper's: LRN with the largest r_i in each dimension in place of their sum.
 
-    Ten distractors whose relations r_i are equal then change z exactly as one of them would. Needs
-    at least one real object in every row.
+    Ten distractors whose relations r_i are equal then change z exactly as one of them would, which
+    a sum has to learn. Needs at least one real object in every row.
     """
 
     def __init__(self, token_dim=64, z_dim=25):                # without the paper's ablations

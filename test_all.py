@@ -2002,33 +2002,6 @@ def test_read_out_loss_is_the_mean_squared_error_of_the_facts():
     assert loss == pytest.approx(np.square(errors).mean(), rel=1e-5)
 
 
-def test_hidden_cubes_show_the_read_out_every_number_of_cubes_and_the_policy_all(env):
-    agent = train.Agent("lrn", 2, {**train.DEFAULTS, "hide_cubes": True})
-    obs = observations(env, count=2)
-    places = obs["cubes"][0, :, 4].tolist()
-    encode, shown = agent.encode, []
-
-    def spy(seen):
-        shown.append(seen["cubes"])
-        return encode(seen)
-
-    agent.encode = spy
-    torch.manual_seed(0)
-    for _ in range(600):
-        agent.auxiliary(obs)
-    sizes = np.bincount([cubes.shape[1] for cubes in shown], minlength=4)
-    # 13.8: what chi-square with 2 degrees of freedom exceeds once in 1000
-    assert sizes[0] == 0 and np.square(sizes[1:] - 200).sum() / 200 < 13.8
-    alone = [places.index(cubes[0, 0, 4].item()) for cubes in shown if cubes.shape[1] == 1]
-    counts = np.bincount(alone, minlength=3)
-    assert np.square(counts - len(alone) / 3).sum() / (len(alone) / 3) < 13.8
-    for cubes in shown:                                        # nobody twice
-        assert len(set(cubes[0, :, 4].tolist())) == cubes.shape[1]
-    shown.clear()
-    agent(obs)
-    assert torch.equal(shown[0], obs["cubes"])
-
-
 def test_read_out_is_read_from_z(env):
     """The loss of a real agent, from its own z and read-out: its gradient reaches the encoder."""
     agent = train.Agent("lrn", 2, train.DEFAULTS)
@@ -2709,9 +2682,6 @@ BAD_INPUT = {                            # start of the command: ((its end, word
         ("--encoder lrn --set heads=2", "--set heads: without effect on lrn"),
         ("--encoder mlp --set token_dim=32", "--set token_dim: without effect on mlp"),
         ("--encoder mlp --set z_dim=5 heads=2", "--set heads: without effect on mlp"),
-        ("--encoder mlp --set hide_cubes=True", "--set hide_cubes: without effect on mlp"),
-        ("--set hide_cubes=True auxiliary=0", "hide_cubes: without effect"),
-        ("--distractors 0 --set hide_cubes=True", "there is one cube only"),
     ),
     "train.py --out": (
         ("file", "--out"),
@@ -3303,8 +3273,8 @@ def test_every_table_stands_in_the_section_of_its_figure(results_scripts):
 
     places = {"push-mlp-n2": "Figure 1", "lift-attn-n2": "Figure 3", "push-lrn-max-n2": "Figure 3",
               "push-rn-n3": "Figure 4", "push-lrn-n2-z100": "Figure 5", "lift-lrn-n0":
-              "Beyond the paper", "push-rn-n2-noreadout": "What we added", "push-lrn-max-n9": "Beyond the paper",
-              "push-rn-n2-hidecubes": "Beyond the paper"}
+              "Beyond the paper", "push-rn-n2-noreadout": "What we added",
+              "push-lrn-max-n9": "Beyond the paper"}
     for group, title in places.items():
         assert figures.section_of(f"results/{group}-seed0") == title, group
     of_figure_5 = {group for lines in figures.ABLATIONS.values() for group in lines}
@@ -3821,12 +3791,6 @@ MUTATIONS = {
          "test_read_out_loss_asks_about_fresh_goals_targets_and_identifiers"),
         ("cubes[..., IDENTIFIER] = identifiers", "identifiers = cubes[..., IDENTIFIER]",
          "test_read_out_loss_asks_about_fresh_goals_targets_and_identifiers"),
-        ("order = torch.randperm(total)", "order = torch.arange(total)",
-         "test_hidden_cubes_show_the_read_out_every_number_of_cubes_and_the_policy_all"),
-        ("torch.randint(1, total + 1, ())", "torch.randint(1, total, ())",
-         "test_hidden_cubes_show_the_read_out_every_number_of_cubes_and_the_policy_all"),
-        ("        if self.hide_cubes:\n            total", "        if False:\n            total",
-         "test_hidden_cubes_show_the_read_out_every_number_of_cubes_and_the_policy_all"),
         ("torch.randint(count, (B,))", "torch.zeros(B, dtype=torch.long)",
          "test_read_out_loss_asks_about_fresh_goals_targets_and_identifiers"),
         ("identifiers[rows, target]", "identifiers[:, 0]",

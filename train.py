@@ -81,7 +81,6 @@ SETTINGS = {
     "normalize_advantages": Setting(True, False, "rlpyt's default"),
     "normalize_values": Setting(True, False, "or large returns drown the policy loss"),
     "auxiliary": Setting(30.0, 0.0, "ours: weight of the read-out loss, see Agent.auxiliary"),
-    "hide_cubes": Setting(False, False, "True: the read-out loss hides some cubes from z"),
     # The networks
     "token_dim": Setting(64, 128, "D; not printed; 64 takes half the time of our guess"),
     "z_dim": Setting(25, 25, "Z (section 5)"),
@@ -166,7 +165,6 @@ class Agent(nn.Module):
         super().__init__()
         D, Z, hidden = settings["token_dim"], settings["z_dim"], settings["hidden"]
         self.kind, self.distractors = encoder, distractors
-        self.hide_cubes = settings["hide_cubes"]
         if encoder != "mlp":
             self.cube = mlp(CUBE_WIDTH, hidden, D)
             self.finger = mlp(FINGER_WIDTH, hidden, D)
@@ -203,17 +201,8 @@ class Agent(nn.Module):
         position and the three fingertips; the loss is their mean squared error. A batch holds few
         episodes, so few answers to "which cube is meant?". Hence the question is asked anew: every
         sample gets fresh identifiers, a random cube as target and the goal of another sample.
-
-        With `hide_cubes` the encoder is shown some of the N+1 cubes, in every minibatch others (one
-        to all, each number equally often), and z must hold the same facts. Only here: the policy
-        always gets all of them.
         """
         cubes, goal = obs["cubes"].clone(), obs["goal"]
-        if self.hide_cubes:
-            total = cubes.shape[1]
-            order = torch.randperm(total)                      # the same for the whole minibatch
-            shown = int(torch.randint(1, total + 1, ()))
-            cubes = cubes[:, order[:shown]]
         B, count = cubes.shape[:2]
         rows, target = torch.arange(B), torch.randint(count, (B,))
         shuffled = torch.rand(B, len(POOL)).argsort(dim=1)
@@ -577,10 +566,6 @@ def read_settings(args):
             fail(f"--set {item}: no such setting; the names are {', '.join(SETTINGS)}")
         refuse_if_without_effect(name, args.encoder)
         settings[name] = read_value(name, text, f"--set {item}")
-    if settings["hide_cubes"] and not settings["auxiliary"]:
-        fail("hide_cubes: without effect, because the read-out loss has no weight (auxiliary=0)")
-    if settings["hide_cubes"] and args.distractors == 0:
-        fail("hide_cubes: without effect, because there is one cube only")
     if args.frames is not None:
         settings["frames"] = read_value("frames", str(args.frames), f"--frames {args.frames}")
     return settings
@@ -589,7 +574,7 @@ def read_settings(args):
 def refuse_if_without_effect(name, encoder):
     """Settings of one encoder do nothing to another: say so instead of ignoring them."""
     takers = [kind for kind, (_, names) in ENCODERS.items() if name in names]
-    if name in ("token_dim", "hide_cubes"):                    # of whatever looks at tokens
+    if name == "token_dim":                                    # of whatever looks at tokens
         takers = [kind for kind in ENCODERS if kind != "mlp"]
     if name == "hidden":                                       # of the heads, too
         takers = list(ENCODERS)

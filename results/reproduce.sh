@@ -27,7 +27,9 @@ all_runs() {
             for encoder in lrn rn attn; do
                 a_run lift $encoder 2 $seed                    # figure 3, bottom
             done
-            a_run push lrn-max 2 $seed
+            for task in push lift; do
+                a_run $task lrn-max 2 $seed
+            done
             for N in 0 1 3; do                                 # figure 4, and LRN of figure 1
                 for encoder in lrn rn attn; do
                     a_run push $encoder $N $seed
@@ -49,10 +51,6 @@ all_runs() {
                 a_run push mlp $N $seed long --frames 9000000
             done
             a_run push lrn-max 9 $seed                         # beyond the paper: 9 in training
-            for encoder in lrn rn attn; do                     # and a read-out of some of the cubes
-                a_run push $encoder 2 $seed hidecubes --set hide_cubes=True
-            done
-            a_run lift lrn 2 $seed hidecubes --set hide_cubes=True
         fi
         if [ $seed = 0 ]; then
             for encoder in lrn rn attn; do                     # without our read-out loss
@@ -90,7 +88,7 @@ one_run() {
         exit 255                                               # xargs starts no other run then
     fi
     numbers=0-9
-    if [[ $name =~ -n[29]-(hidecubes-)?seed ]]; then
+    if [[ $name =~ -n[29]-seed ]]; then
         numbers=0-9,14,19                                      # figure 3, and beyond
     fi
     if [[ $name =~ -mlp-n([0-9]+) ]]; then
