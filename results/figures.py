@@ -321,6 +321,8 @@ def figure_1(folder):
             runs = {N: groups.get(name.format(N), []) for N in range(4)}
             frames = {N: frames_to(runs[N], threshold) for N in runs}
             places = [N for N in runs for _ in runs[N]]
+            if not places:
+                label += " (not run)"
             panel.plot(places, np.concatenate(list(frames.values())), marker, color=color,
                        alpha=0.7, label=label)
             for N in runs:
@@ -329,6 +331,7 @@ def figure_1(folder):
                                    xycoords=("data", "axes fraction"), textcoords="offset points")
         panel.set(title=f"PushingCube: frames to reach {threshold}", xlabel="N in training",
                   xticks=range(4), xlim=(-0.5, 3.5))
+        panel.margins(y=0.4)                                   # room for "never"
     axes[0].set(ylabel="million frames, each run a dot", ylim=(0, None))
     axes[0].legend(loc="lower right")
     save(figure, folder, "figure1.png")
