@@ -5,8 +5,8 @@
     python train.py --encoder lrn --resume                 go on, bit for bit as if never stopped
     python train.py --encoder lrn --paper --out runs/paper             the paper's numbers
     python train.py --encoder lrn --set z_dim=50 --out runs/z50        any of SETTINGS, by name
-    torchrun --nproc-per-node 2 train.py --encoder rn      for several machines (on one, a process
-                                                           per core is the default: --ranks)
+    torchrun --nproc-per-node 2 train.py --encoder rn      with --nnodes on several machines (on
+                                                           one, --ranks is the simpler way)
 
 Data flow: observation -> a small MLP per type -> objects (B, K, D), goal (B, D) -> encoder
            -> z (B, Z) -> heads: mean (B, 9), value (B,)
