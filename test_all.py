@@ -7,6 +7,7 @@ Run:    pytest -q                                        3 to 4 minutes on 2 cor
 """
 import ast
 import csv
+import io
 import itertools
 import math
 import os
@@ -2427,6 +2428,28 @@ def kill(process, folder, rng, while_writing):
     return max([seen, *filter(None, map(update_of, rest.splitlines()))])
 
 
+class InterruptedFile(io.FileIO):
+    """Ctrl-C comes with the third piece that is written."""
+
+    pieces = 0
+
+    def write(self, piece):
+        self.pieces += 1
+        if self.pieces == 3:
+            raise KeyboardInterrupt
+        return super().write(piece)
+
+
+def test_a_stop_in_the_middle_of_a_checkpoint_stays_a_stop(tmp_path, monkeypatch):
+    """torch.save, left by an exception, raises one of its own (RuntimeError, "unexpected pos")."""
+    path = str(tmp_path / "checkpoint.pt")
+    train.save({"x": torch.zeros(1000)}, path)
+    monkeypatch.setattr(train, "open", InterruptedFile, raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        train.save({"x": torch.ones(1000)}, path)
+    assert torch.equal(torch.load(path)["x"], torch.zeros(1000))           # the old one
+
+
 @needs_proc
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_stopped_killed_and_resumed_equals_never_stopped(ranks, tmp_path):
@@ -3772,6 +3795,9 @@ MUTATIONS = {
          "test_picture_shows_target_goal_and_distractors_in_their_colours"),
     ),
     "train.py": (
+        # Files
+        ("if isinstance(error.__context__, KeyboardInterrupt):", "if False:",
+         "test_a_stop_in_the_middle_of_a_checkpoint_stays_a_stop"),
         # The agent
         ("*layers[:-1]", "*layers", "test_mlps_are_orthogonal_and_end_in_a_linear_layer"),
         ("last_gain if is_last else", "1.0 if is_last else",

@@ -276,7 +276,12 @@ def agent_weights(learner_weights):
 def save(checkpoint, path):
     """Write a checkpoint so that a crash leaves the old or the new one, never half of it."""
     with open(path + ".tmp", "wb") as file:
-        torch.save(checkpoint, file)
+        try:
+            torch.save(checkpoint, file)
+        except RuntimeError as error:    # torch's own, raised on the way out of a Ctrl-C
+            if isinstance(error.__context__, KeyboardInterrupt):
+                raise error.__context__ from None
+            raise
         file.flush()
         os.fsync(file.fileno())
     os.replace(path + ".tmp", path)
