@@ -68,6 +68,11 @@ def is_blocked(obs):
     return bool((np.linalg.norm(others - nearest, axis=1) < CUBE).any())
 
 
+def chunks(episodes):
+    """A range of episode numbers in parts of at most CHUNK."""
+    return [episodes[first:first + CHUNK] for first in range(0, len(episodes), CHUNK)]
+
+
 # ---- playing
 
 def as_batch(observations):
@@ -229,17 +234,16 @@ def evaluate(run, distractors, episodes, sample_actions=False):
           f"distractors, {checkpoint['frames']} frames; {episodes} episodes each, "
           f"{'sampled' if sample_actions else 'mean'} actions")
     print(HEADER, flush=True)
-    firsts = range(0, episodes, CHUNK)
-    chunks = [(run, n, first, min(CHUNK, episodes - first), sample_actions)
-              for n in distractors for first in firsts]
+    parts = chunks(range(episodes))
+    tasks = [(run, n, part[0], len(part), sample_actions) for n in distractors for part in parts]
     context = multiprocessing.get_context("spawn")
     rows, begin = [], time.monotonic()
     # Ctrl-C is for the main process alone: leaving the pool ends the others.
-    with context.Pool(min(os.cpu_count(), len(chunks)), initializer=signal.signal,
+    with context.Pool(min(os.cpu_count(), len(tasks)), initializer=signal.signal,
                       initargs=(signal.SIGINT, signal.SIG_IGN)) as pool:
-        parts = pool.imap(play_chunk, chunks)                  # in order, as they are done
+        results = pool.imap(play_chunk, tasks)                 # in order, as they are done
         for n in distractors:
-            played = [episode for _ in firsts for episode in next(parts)]
+            played = [episode for _ in parts for episode in next(results)]
             rows.append(summary(n, played))
             share = len(rows) / len(distractors)
             elapsed = time.monotonic() - begin

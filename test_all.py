@@ -3944,7 +3944,7 @@ MUTATIONS = {
         ("half_width(strict)", "half_width(rho)", "test_summary_of_four_episodes_by_hand"),
         ("nan(rho[is_clear])", "nan(rho[~is_clear])", "test_summary_of_four_episodes_by_hand"),
         ("1000 * row['read_error']", "100 * row['read_error']", "test_a_row_is_printed_as_it_is"),
-        ("min(CHUNK, episodes - first)", "CHUNK",
+        ("episodes[first:first + CHUNK]", "range(first, first + CHUNK)",
          "test_evaluation_prints_each_n_as_it_is_done_with_the_time_left"),
         ("elapsed / share - elapsed", "elapsed / share",
          "test_evaluation_prints_each_n_as_it_is_done_with_the_time_left"),

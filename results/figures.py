@@ -264,10 +264,10 @@ def draw(axes, x, curves, label, color, marker=None):
     axes.fill_between(x, lowest, highest, color=color, alpha=0.15, linewidth=0)
 
 
-def draw_zero_shot(axes, cells, label, color, marker="o"):
+def draw_zero_shot(axes, cells, label, color):
     """Scores {N: Cell} of several seeds at every N."""
     values = np.array([cell.values for cell in cells.values()]).T          # (S, numbers)
-    draw(axes, list(cells), values, label, color, marker)
+    draw(axes, list(cells), values, label, color, marker="o")
 
 
 def with_seeds(label, runs):

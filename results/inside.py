@@ -23,7 +23,7 @@ import torch
 HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path.insert(0, os.path.dirname(HERE))
 import evaluate
-from figures import KINDS
+from figures import KINDS, PAPER
 from train import fail, load
 from trifinger_env import IDENTIFIER, TIME
 
@@ -38,8 +38,8 @@ def watch(run, distractors, episodes, look):
     """look(agent, obs) -> (B, ...) after every step of `episodes` (a range): (steps, E, ...)."""
     checkpoint, agent = load(run)
     seen = []
-    for first in range(0, len(episodes), evaluate.CHUNK):
-        seeds = [evaluate.episode_seed(e) for e in episodes[first:first + evaluate.CHUNK]]
+    for part in evaluate.chunks(episodes):
+        seeds = [evaluate.episode_seed(e) for e in part]
         envs, observations, _ = evaluate.start(checkpoint, agent, distractors, seeds)
         steps = []
         for _ in range(checkpoint["settings"]["episode_steps"]):
@@ -115,7 +115,7 @@ def moments(steps):
 def figure_6(episodes):
     """z by N, encoder by encoder."""
     dots, drifts = [], []
-    for encoder in ("attn", "rn", "lrn"):
+    for encoder in PAPER:
         run = os.path.join(HERE, f"push-{encoder}-n2-seed0")
         if not os.path.exists(run):
             print(f"figure 6 without {encoder}: {run} is not there")

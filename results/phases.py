@@ -59,9 +59,8 @@ def watch(run, distractors, episodes):
     """Heights of the goals (E,) and what the episodes came to (E, columns)."""
     checkpoint, agent = load(run)
     heights, rows = [], []
-    for first in range(0, episodes, evaluate.CHUNK):
-        count = min(evaluate.CHUNK, episodes - first)
-        seeds = [evaluate.episode_seed(first + e) for e in range(count)]
+    for part in evaluate.chunks(range(episodes)):
+        seeds = [evaluate.episode_seed(e) for e in part]
         envs, observations, _ = evaluate.start(checkpoint, agent, distractors, seeds)
         watched = [Watched(env) for env in envs]
         evaluate.to_the_end(agent, watched, observations)

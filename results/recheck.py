@@ -24,9 +24,8 @@ NUMBERS = (2, 9)                         # of distractors
 def play_others(run, distractors, episodes):
     """A row of zeroshot.csv from episodes FIRST, FIRST + 1, ..."""
     played = []
-    for first in range(FIRST, FIRST + episodes, evaluate.CHUNK):
-        count = min(evaluate.CHUNK, FIRST + episodes - first)
-        played += evaluate.play(run, distractors, first, count, sample_actions=False)
+    for part in evaluate.chunks(range(FIRST, FIRST + episodes)):
+        played += evaluate.play(run, distractors, part[0], len(part), sample_actions=False)
     return evaluate.summary(distractors, played)
 
 

@@ -27,12 +27,15 @@ def success_at(rows, frames):
 def main():
     print("| run | lr | std | " + " | ".join(f"{point} M" for point in POINTS) + " |")
     print("|---" * (3 + len(POINTS)) + "|")
+    frames = []
     for path in sorted(glob.glob(os.path.join(HERE, "search", "*.csv"))):
         with open(path, newline="") as file:
             rows = list(csv.DictReader(file))
         start = f"{float(rows[0]['lr']):.1e}", f"{float(rows[0]['std']):.2f}"
         cells = [success_at(rows, point * 1e6) for point in POINTS]
         print(f"| {os.path.basename(path)[:-4]} | " + " | ".join([*start, *cells]) + " |")
+        frames.append(int(rows[-1]["frames"]))
+    print(f"\n{len(frames)} runs, {sum(frames) / 1e6:.0f} million frames")
 
 
 if __name__ == "__main__":
