@@ -61,7 +61,7 @@ SECTIONS = {                             # of the tables -> groups of runs; the 
     "Figure 3": "-n2$",
     "Figure 4": "push-.*-n[013]$",
     "Figure 5": "-n2-(norelations|mean|z[0-9]+|no(overlap|distance|reach)|curiosity)$",
-    "What we added": "-noreadout$",
+    "What we added": "-(noreadout|rawvalues|rawadvantages|absolute)$",
     "Beyond the paper": "",
 }
 KINDS = {                                # of relations -> colour, those of the paper's figure 7

@@ -56,6 +56,9 @@ all_runs() {
             for encoder in lrn rn attn; do                     # without our read-out loss
                 a_run push $encoder 2 $seed noreadout --set auxiliary=0
             done
+            a_run push lrn 2 $seed rawvalues --set normalize_values=False
+            a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
+            a_run push lrn 2 $seed absolute --set action_mode=absolute
             a_run push lrn 9 $seed
             a_run lift lrn 0 $seed
         fi
