@@ -44,9 +44,9 @@ def gae(rewards, values, next_values, terminated, done, discount, lam):
 
 
 def normal_log_prob(actions, mean, log_std):
-    """Log density (n,) of actions (n, A) under a Gaussian with independent components."""
+    """Log density (...) of actions (..., A) under a Gaussian with independent components."""
     scaled = (actions - mean) * torch.exp(-log_std)
-    log_density = -0.5 * scaled ** 2 - log_std - 0.5 * math.log(2 * math.pi)           # (n, A)
+    log_density = -0.5 * scaled ** 2 - log_std - 0.5 * math.log(2 * math.pi)           # (..., A)
     return log_density.sum(-1)
 
 

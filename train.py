@@ -49,18 +49,18 @@ class Setting(NamedTuple):
 # rlpyt: not printed, from the PPO library that the paper uses.
 SETTINGS = {
     # The run
-    "frames": Setting(3_000_000, 60_000_000, "environment steps in all; CW trains 60 M"),
+    "frames": Setting(3_000_000, 60_000_000, "environment steps in all; B.3 names 50 M, CW 60 M"),
     "envs": Setting(32, 48, "environments in all; CW: 20 x 6000 steps, as many as 48 x 2500"),
     "steps": Setting(125, 2500, "T, steps of a rollout: one episode"),
     # The environment
-    "episode_steps": Setting(125, 2500, "5 s, not 30 s: more episodes show more goals"),
-    "substeps": Setting(5, 3, "25 Hz, not 83.3 Hz: exploration moves further per decision"),
-    "timestep": Setting(0.008, 0.004, "s; a step costs the same, and 8 ms still behave (tested)"),
+    "episode_steps": Setting(125, 2500, "5 s, not 30 s (4.1): more episodes show more goals"),
+    "substeps": Setting(5, 3, "25 Hz, not 83.3 (4.1, CW): noise moves further"),
+    "timestep": Setting(0.008, 0.004, "s; CW: 0.004; costs the same, and 8 ms behave (tested)"),
     "action_mode": Setting("integrated", "absolute", "targets that stay keep a grip; CW: absolute"),
     "action_scale": Setting(0.1, 0.1, "rad, largest step of an action"),
-    "cube_mass": Setting(0.08, 0.02, "kg; CW's picking task"),
+    "cube_mass": Setting(0.08, 0.02, "kg; CW's pushing and picking tasks: 0.02"),
     "finger_friction": Setting(1.0, 0.1, "IsaacGymEnvs; CW: 0.1, which holds no 0.08 kg"),
-    "goal_yaw": Setting(0.0, math.pi / 4, "an axis-aligned goal asks for the position only"),
+    "goal_yaw": Setting(0.0, math.pi / 4, "or a goal asks for the yaw, too (4.1: a pose; CW: any)"),
     "reward_overlap": Setting(100.0, 100.0, "alpha_1 (A.1)"),
     "reward_distance": Setting(5000.0, 250.0, "alpha_2 (A.1): as printed, 2 mm are worth 0.5"),
     "reward_curiosity": Setting(0.0, 10.0, "alpha_3 (A.1): never positive, pays for throwing"),
@@ -126,6 +126,7 @@ class ConcatMLP(nn.Sequential):
     """The paper's naive baseline (figure 1, right): one MLP on the concatenated observation -> z.
 
     Its first layer has a fixed width, so it works at the N it was built for; ValueError at others.
+    The paper says no more of it; two hidden layers and the LayerNorm are our choice.
     """
 
     def __init__(self, distractors, z_dim, hidden):
@@ -538,7 +539,7 @@ def read_command(argv=None):
              f"(default {DEFAULTS['frames']}, lift {LIFT_SETTINGS['frames']})")
     add("--out", metavar="DIR", help="run folder (default runs/TASK-ENCODER-nN-seedS)")
     add("--paper", action="store_true",
-        help="the paper's numbers; where it prints none, those of its sources")
+        help="the paper's numbers; where it prints none, its sources' or a guess")
     add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="change some of SETTINGS")
     add("--resume", action="store_true", help="go on from the run folder's checkpoint")
     add("--overwrite", action="store_true", help="start anew in a folder that holds a run")

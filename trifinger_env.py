@@ -33,10 +33,11 @@ GRASP_RADIUS = 0.124                     # inside it a finger can get behind a c
 OUTSIDE, BELOW, ABOVE = WALL + 0.03, -0.03, 1.0                # beyond them a cube has left, m
 CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multiplies the two in touch
 # A cube's mass and the fingers' friction are arguments, because sources differ. CausalWorld has
-# 0.08 kg (0.02 in its picking task) and 0.1, with which a cube can hardly be held
+# 0.08 kg (0.02 in its pushing and picking tasks) and 0.1, with which a cube can hardly be held
 # (results/grasp.py); trifinger_simulation 0.08 kg and 0.5; IsaacGymEnvs 0.08 kg and 1.0, as we do.
 # A real cube weighs 0.094 kg.
 IDENTIFIERS = np.linspace(-1.0, 1.0, 21)                       # pool: none is new when N grows
+HIGHEST_GOAL = 0.2                       # height of the centre of the highest goal in lifting, m
 FIXED = 5                                # squares never nudged: three fingers, goal, target
 
 # The robot: three fingers of three joints each, upper, middle and lower
@@ -550,7 +551,7 @@ class TriFingerEnv(Env):
         self._ids = self._np_random.choice(IDENTIFIERS, count, replace=False).tolist()
         height = CUBE / 2
         if self.task == "lift":
-            height = float(self._np_random.uniform(CUBE / 2, 0.2))
+            height = float(self._np_random.uniform(CUBE / 2, HIGHEST_GOAL))
         self._set_goal(goal, height)
         target_pose, *poses = cubes
         poses.insert(self.target, target_pose)
