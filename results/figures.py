@@ -54,13 +54,15 @@ ABLATIONS = {                            # panels of figure 5: title -> {group o
     "Reward: curiosity": {
         "push-lrn-n2": "without",
         "push-lrn-n2-curiosity": "with, weight 10",
+        "push-lrn-n2-paperreward": "the paper's three terms",
     },
 }
 SECTIONS = {                             # of the tables -> groups of runs; the first match counts
     "Figure 1": "-mlp-",
     "Figure 3": "-n2$",
     "Figure 4": "push-.*-n[013]$",
-    "Figure 5": "-n2-(norelations|mean|z[0-9]+|no(overlap|distance|reach)|curiosity)$",
+    "Figure 5": "-n2-(norelations|mean|z[0-9]+|no(overlap|distance|reach)|curiosity|"
+                "paperreward)$",
     "What we added": "-(noreadout|rawvalues|rawadvantages|absolute)$",
     "Beyond the paper": "",
 }
@@ -284,7 +286,7 @@ def draw_groups(axes, groups, lines):
         else:
             axes.plot([], [], color=color, label=f"{label} (not run)")
     axes.set(xlabel="N, distractors at test time", xlim=(-0.4, 9.4), ylim=(0, 1), xticks=range(10))
-    axes.legend(loc="lower left", fontsize=8)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
 
 
 def training_success(run):
@@ -365,7 +367,7 @@ def figure_4(folder):
     plt = pyplot()
     groups = by_seed(shipped_runs())
     need_runs(groups, [f"push-{encoder}-n{N}" for encoder in PAPER for N in (0, 1, 3)])
-    figure, axes = plt.subplots(1, 3, figsize=(11, 3.5), layout="constrained", sharey=True)
+    figure, axes = plt.subplots(1, 3, figsize=(11, 4), layout="constrained", sharey=True)
     for encoder, panel in zip(PAPER, axes):
         draw_groups(panel, groups, {f"push-{encoder}-n{N}": f"trained at {N}" for N in range(4)})
         panel.set(title=LINES[encoder][0])
@@ -378,7 +380,7 @@ def figure_5(folder):
     plt = pyplot()
     groups = by_seed(shipped_runs())
     need_runs(groups, [name for lines in ABLATIONS.values() for name in list(lines)[1:]])
-    figure, axes = plt.subplots(2, 2, figsize=(9, 7), layout="constrained", sharey=True)
+    figure, axes = plt.subplots(2, 2, figsize=(9, 8), layout="constrained", sharey=True)
     for (title, lines), panel in zip(ABLATIONS.items(), axes.flat):
         draw_groups(panel, groups, lines)
         panel.set(title=title)

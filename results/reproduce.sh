@@ -44,6 +44,8 @@ all_runs() {
             a_run push lrn 2 $seed nodistance --set reward_distance=0
             a_run push lrn 2 $seed noreach --set reward_reach=0
             a_run push lrn 2 $seed curiosity --set reward_curiosity=10
+            a_run push lrn 2 $seed paperreward --set reward_distance=250 reward_reach=0 \
+                reward_curiosity=10
         fi
         if [ $seed -le 1 ]; then
             for N in 0 1 2; do                                 # MLP of figure 1
