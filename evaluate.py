@@ -16,7 +16,9 @@ import argparse
 import csv
 import multiprocessing
 import os
+import shutil
 import signal
+import tempfile
 import time
 from functools import lru_cache
 from typing import NamedTuple
@@ -25,8 +27,8 @@ import numpy as np
 import pybullet
 import torch
 
-from train import derived_seed, fail, load, make_env
-from trifinger_env import CUBE, IDENTIFIER, POSITION, POSITION_SCALE, SOLVED, TIME
+from train import STOPPED, checkpoint_file, cores, derived_seed, fail, load, make_env, positive
+from trifinger_env import CUBE, IDENTIFIER, IDENTIFIERS, POSITION, POSITION_SCALE, SOLVED, TIME
 
 COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict",
            "solved", "cut_short", "blocked", "success_clear", "success_blocked", "z_drift",
@@ -221,9 +223,17 @@ def print_row(row, seconds_left):
 def evaluate(run, distractors, episodes, sample_actions=False):
     """Play `episodes` episodes at every N in `distractors` on all cores.
 
-    Prints and returns rows, each as soon as its N is done.
+    Prints and returns rows, each as soon as its N is done. A copy of the checkpoint is played, as a
+    run that is still being trained replaces its own.
     """
-    checkpoint, _ = load(run)
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copy(checkpoint_file(run), folder)
+        return evaluate_copy(folder, run, distractors, episodes, sample_actions)
+
+
+def evaluate_copy(path, run, distractors, episodes, sample_actions):
+    """Rows of the agent in `path`; `run` is the name to print."""
+    checkpoint, _ = load(path)
     trained = checkpoint["distractors"]
     if checkpoint["encoder"] == "mlp" and distractors != [trained]:
         print(f"{run}: an mlp has a fixed input, so it can be played at its own N = {trained} only")
@@ -235,11 +245,11 @@ def evaluate(run, distractors, episodes, sample_actions=False):
           f"{'sampled' if sample_actions else 'mean'} actions")
     print(HEADER, flush=True)
     parts = chunks(range(episodes))
-    tasks = [(run, n, part[0], len(part), sample_actions) for n in distractors for part in parts]
+    tasks = [(path, n, part[0], len(part), sample_actions) for n in distractors for part in parts]
     context = multiprocessing.get_context("spawn")
     rows, begin = [], time.monotonic()
     # Ctrl-C is for the main process alone: leaving the pool ends the others.
-    with context.Pool(min(os.cpu_count(), len(tasks)), initializer=signal.signal,
+    with context.Pool(min(cores(), len(tasks)), initializer=signal.signal,
                       initargs=(signal.SIGINT, signal.SIG_IGN)) as pool:
         results = pool.imap(play_chunk, tasks)                 # in order, as they are done
         for n in distractors:
@@ -300,7 +310,9 @@ def play_live(agent, env, episode, sample_actions):
 def watch(run, distractors, episodes, sample_actions):
     """Play episodes in PyBullet's window, in real time, until it is closed or Ctrl-C."""
     checkpoint, agent = load(run)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)               # or a window that never comes hangs
     env = make_env(checkpoint["task"], distractors, checkpoint["settings"], render_mode="human")
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     print(f"{run} plays {episodes} episodes with {distractors} distractors; target blue, goal "
           f"green, distractors red; close the window or press Ctrl-C to stop", flush=True)
     try:
@@ -344,7 +356,7 @@ def parse_range(text):
     try:
         for part in text.split(","):
             low, _, high = part.partition("-")
-            numbers.update(range(int(low), int(high or low) + 1))
+            numbers.update(range(int(low), min(int(high or low), len(IDENTIFIERS)) + 1))
     except ValueError:
         fail(f"--distractors must look like 0-9 or 0,2,5, got {text!r}")
     if not numbers:
@@ -360,7 +372,8 @@ def read_command():
     add("runs", nargs="+", metavar="RUN", help="run folder of train.py")
     add("--distractors", metavar="LIST",
         help="numbers of distractors, as 0-9 or 0,2,14 (default 0-9; to watch: as trained)")
-    add("--episodes", type=int, default=200, metavar="E", help="episodes at each N (default 200)")
+    add("--episodes", type=positive, default=200, metavar="E",
+        help="episodes at each N (default 200)")
     add("--sample-actions", action="store_true",
         help="sample actions as in training instead of playing the policy's means")
     add("--save", action="store_true",
@@ -368,8 +381,8 @@ def read_command():
     add("--watch", action="store_true", help="play the first run live in a window")
     add("--gif", metavar="FILE", help="film one episode of the first run")
     args = parser.parse_args()
-    if args.episodes < 1:
-        fail(f"--episodes must be at least 1, got {args.episodes}")
+    if args.gif and not args.gif.endswith(".gif"):
+        fail(f"--gif {args.gif}: the file's name must end in .gif")
     if args.gif and not os.path.isdir(os.path.dirname(args.gif) or "."):
         fail(f"--gif {args.gif}: there is no folder {os.path.dirname(args.gif)}")
     if args.save and (args.watch or args.gif):
@@ -395,6 +408,8 @@ def sweep(args):
     for run in args.runs:
         checkpoint, _ = load(run)
         make_env(checkpoint["task"], numbers[-1], checkpoint["settings"]).close()
+        if args.save and not os.path.isdir(run):
+            fail(f"--save needs a run folder to write to, {run} is a file")
         if args.save:
             check_csv(os.path.join(run, name))
     for run in args.runs:
@@ -413,7 +428,7 @@ def main():
     except (ValueError, OSError) as error:
         fail(str(error))
     except KeyboardInterrupt:
-        fail("stopped; with --save, runs that were played to the end have their CSV", status=130)
+        fail("stopped; with --save, runs that were played to the end have their CSV", STOPPED)
 
 
 if __name__ == "__main__":

@@ -2129,8 +2129,14 @@ def test_as_many_ranks_as_cores_and_batch_allow(monkeypatch):
     """6 environments, 50 steps, 4 minibatches: 1 or 3 ranks give whole parts, 2 or 6 do not."""
     settings = {"envs": 6, "steps": 50, "minibatches": 4}
     for cores, ranks in ((1, 1), (2, 1), (4, 3), (16, 3)):
-        monkeypatch.setattr(os, "cpu_count", lambda: cores)
+        monkeypatch.setattr(os, "sched_getaffinity", lambda pid: range(cores))
         assert train.choose_ranks(settings) == ranks
+
+
+def test_set_may_be_given_twice(tmp_path):
+    _, settings = train.parse(["--out", str(tmp_path / "new"), "--set", "z_dim=7", "--set",
+                               "auxiliary=2", "clip=0.3"])
+    assert (settings["z_dim"], settings["auxiliary"], settings["clip"]) == (7, 2.0, 0.3)
 
 
 # ---------------------------------------------------------------- training
@@ -2412,7 +2418,7 @@ def stop(process, ranks):
     else:
         rest = end(process, signal.SIGINT, whole_group=True)
     seconds = time.monotonic() - begin
-    assert process.returncode == 0 and "stopped after" in rest and seconds < 10
+    assert process.returncode == 130 and "stopped after" in rest and seconds < 10
     return seconds
 
 
@@ -2448,6 +2454,24 @@ def test_a_stop_in_the_middle_of_a_checkpoint_stays_a_stop(tmp_path, monkeypatch
     with pytest.raises(KeyboardInterrupt):
         train.save({"x": torch.ones(1000)}, path)
     assert torch.equal(torch.load(path)["x"], torch.zeros(1000))           # the old one
+
+
+@needs_proc
+@pytest.mark.parametrize("delay", [0.2, 3.0])
+def test_ctrl_c_before_the_first_update_ends_both_ranks(delay, tmp_path):
+    """While the second rank is still importing, and later; 60 s are far below gloo's 10 minutes."""
+    process = start("train.py", "--ranks", "2", "--out", str(tmp_path / "run"))
+    while len(alive(process.pid)) < 3:                         # two ranks and a resource tracker
+        time.sleep(0.01)
+    time.sleep(delay)
+    os.killpg(process.pid, signal.SIGINT)
+    try:
+        printed, errors = process.communicate(timeout=60)
+        wait_for_the_end_of(process.pid)
+    finally:
+        for pid in alive(process.pid):
+            os.kill(pid, signal.SIGKILL)
+    assert process.returncode == 130 and "stopped" in printed and "Traceback" not in errors, errors
 
 
 @needs_proc
@@ -2505,8 +2529,9 @@ def test_a_stop_in_the_middle_of_an_update_goes_back_to_its_beginning(
 
     monkeypatch.setattr(train.PPO, "minibatch_step", interrupted)
     capsys.readouterr()
-    command(*words, cut)
-    assert "stopped after 2 updates" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stop:
+        command(*words, cut)
+    assert stop.value.code == 130 and "stopped after 2 updates" in capsys.readouterr().out
     assert train.load(str(cut))[0]["frames"] == 400
     command(*words, cut, "--resume")
     expected, ours = (torch.load(folder / "checkpoint.pt", weights_only=True)["learner"]
@@ -2683,6 +2708,7 @@ BAD_INPUT = {                            # start of the command: ((its end, word
         ("--frames many", "--frames"),
         ("--seed -1", "--seed"),
         ("--seed x", "--seed"),
+        (f"--seed {2 ** 32}", "--seed"),
         ("--ranks 0", "--ranks"),
         ("--ranks 3", "--ranks"),
         ("--save-minutes soon", "--save-minutes"),
@@ -2698,6 +2724,8 @@ BAD_INPUT = {                            # start of the command: ((its end, word
         ("--set lr=nan", "lr"),
         ("--set log_std=inf", "log_std"),
         ("--set minibatches=7", "minibatches"),
+        ("--set episode_steps=126", "never see the end of an episode"),
+        ("--set z_dim=7 --set joy=1", "joy"),
         ("--set action_mode=torque", "action_mode"),
         ("--encoder attn --set heads=7", "heads"),
         ("--encoder rn --set relations=False", "--set relations: without effect on rn"),
@@ -2740,6 +2768,9 @@ BAD_INPUT = {                            # start of the command: ((its end, word
         ("foreign", "zeroshot.csv"),
         ("good --gif nowhere/a.gif", "nowhere"),
         ("good --gif a.gif", "--save"),
+        ("good --gif a.jpg", ".gif"),
+        ("good --distractors 0-1000000000", "distractors"),
+        ("good/checkpoint.pt", "--save needs a run folder"),
     ),
 }
 
@@ -3016,6 +3047,29 @@ class InThisProcess:
         pass
 
     imap = staticmethod(map)
+
+
+def test_a_run_that_trains_on_meanwhile_does_not_change_what_is_evaluated(
+        trained, tmp_path, monkeypatch):
+    """Its checkpoint is replaced after the look at it, before the first episode is played."""
+    def read_errors(run):
+        return [row["read_error"] for row in evaluate.evaluate(str(run), [0, 1], 2)]
+
+    expected = read_errors(trained)
+    copy = shutil.copytree(trained, tmp_path / "run")
+    load = evaluate.load
+
+    def load_and_replace(path):
+        checkpoint, agent = load(path)
+        later = {**checkpoint, "learner": {name: value + 0.1 for name, value
+                                           in checkpoint["learner"].items()}}
+        train.save(later, str(copy / "checkpoint.pt"))
+        return checkpoint, agent
+
+    monkeypatch.setattr(evaluate, "load", load_and_replace)
+    assert read_errors(copy) == expected
+    monkeypatch.undo()
+    assert read_errors(copy) != expected
 
 
 def test_evaluation_prints_each_n_as_it_is_done_with_the_time_left(simple, monkeypatch, capsys):
@@ -3359,6 +3413,10 @@ def test_a_shipped_run_has_the_same_weights_and_no_optimiser(trained, tmp_path, 
     assert sizes[1] < 0.5 * sizes[0]
     assert sorted(os.listdir(tmp_path / "shipped")) == ["checkpoint.pt", "progress.csv",
                                                         "timing.csv"]
+    assert not agent.training                                  # no dropout in evaluation
+    (tmp_path / "shipped" / "zeroshot.csv").touch()
+    with pytest.raises(ValueError, match="holds a run already"):
+        ship.ship(trained, str(tmp_path / "shipped"))
 
 
 def test_every_shipped_run_has_its_command():
@@ -3390,8 +3448,10 @@ def test_reproduce_lists_what_a_pattern_names_and_refuses_unknown_options():
 
     before, after = reproduce("--list", "lift-rn"), reproduce("lift-rn", "--list")
     assert before.stdout == after.stdout and before.stdout.count("\n") == 3
-    refused = reproduce("--help")
-    assert refused.returncode == 2 and len(refused.stderr.splitlines()) == 1
+    for words in (["--help"], ["nosuch"], ["--list", "nosuch"], ["push", "lift"], ["--jobs"],
+                  ["--jobs", "many"]):
+        refused = reproduce(*words)
+        assert refused.returncode == 2 and len(refused.stderr.splitlines()) == 1, words
 
 
 def test_a_recentred_lrn_is_the_same_at_its_n_and_ignores_constant_distractors(results_scripts):
@@ -3796,6 +3856,16 @@ MUTATIONS = {
     ),
     "train.py": (
         # Files
+        ("return checkpoint, agent.eval()", "return checkpoint, agent",
+         "test_a_shipped_run_has_the_same_weights_and_no_optimiser"),
+        ("len(os.sched_getaffinity(0))", "os.cpu_count()",
+         "test_as_many_ranks_as_cores_and_batch_allow"),
+        ("nargs=\"+\", action=\"extend\", default=[]", "nargs=\"+\", default=[]",
+         "test_set_may_be_given_twice"),
+        ("SIG_IGN)               # the others inherit it", "SIG_DFL)",
+         "test_ctrl_c_before_the_first_update_ends_both_ranks"),
+        ("        sys.exit(STOPPED)", "        return",
+         "test_a_stop_in_the_middle_of_an_update_goes_back_to_its_beginning"),
         ("if isinstance(error.__context__, KeyboardInterrupt):", "if False:",
          "test_a_stop_in_the_middle_of_a_checkpoint_stays_a_stop"),
         # The agent
@@ -3906,6 +3976,8 @@ MUTATIONS = {
          "test_bad_input_ends_with_one_line_and_status_2"),
     ),
     "evaluate.py": (
+        ("tasks = [(path, n,", "tasks = [(run, n,",
+         "test_a_run_that_trains_on_meanwhile_does_not_change_what_is_evaluated"),
         ("derived_seed(EVALUATION, episode)", "derived_seed(EVALUATION, 0)",
          "test_evaluation_starts_belong_to_no_training_run"),
         ("EVALUATION = 20220131", "EVALUATION = 0",

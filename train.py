@@ -237,10 +237,16 @@ def derived_seed(*numbers):
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
+STOPPED = 130                            # exit status after a Ctrl-C, as shells have it
 NOISE_STREAM = 10 ** 6                   # stream e < 10^6: environment e; 10^6 + r: torch on rank r
 
 
 # ---- files of a run
+
+def checkpoint_file(path):
+    """The checkpoint of a run folder; a file is one itself."""
+    return os.path.join(path, "checkpoint.pt") if os.path.isdir(path) else path
+
 
 def load(path):
     """Checkpoint dict of a file or run folder, and its agent.
@@ -248,7 +254,7 @@ def load(path):
     A setting that the checkpoint lacks takes its default. ValueError in one line if it is not a
     checkpoint of ours.
     """
-    path = os.path.join(path, "checkpoint.pt") if os.path.isdir(path) else path
+    path = checkpoint_file(path)
     try:
         checkpoint = torch.load(path, weights_only=True, map_location="cpu")
         for key in ("task", "seed", "ranks", "update", "frames", "seconds"):
@@ -265,7 +271,7 @@ def load(path):
                          f"({type(error).__name__}: {reason})") from None
     if not all(torch.isfinite(value).all() for value in checkpoint["learner"].values()):
         raise ValueError(f"{path} holds weights that are not finite")
-    return checkpoint, agent
+    return checkpoint, agent.eval()      # for an encoder of your own, with dropout, say
 
 
 def agent_weights(learner_weights):
@@ -389,17 +395,21 @@ class Run:
 
 # ---- training
 
-def join_ranks():
-    """(rank, number of ranks) of this process, after the ranks have found each other."""
-    rank, ranks = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+def join_ranks(ranks):
+    """Rank of this process, after the ranks have found each other."""
     torch.set_num_threads(1)
     if ranks > 1:
         dist.init_process_group("gloo", timeout=timedelta(minutes=10))
-    return rank, ranks
+    return int(os.environ.get("RANK", 0))
 
 
 def leave_ranks(ranks, stopped):
-    """Leave together, so that nobody waits for a rank that is gone; a stop ends the others."""
+    """Leave together, so that nobody waits for a rank that is gone.
+
+    A stop ends this process with the status of a Ctrl-C, and the others.
+    """
+    if ranks == 1 and stopped:
+        sys.exit(STOPPED)
     if ranks == 1:
         return
     if stopped:
@@ -409,7 +419,7 @@ def leave_ranks(ranks, stopped):
         dist.barrier()
         dist.destroy_process_group()
     sys.stdout.flush()
-    os._exit(0)                          # python's own shutdown may meet gloo's threads and abort
+    os._exit(STOPPED if stopped else 0)  # python's own shutdown may meet gloo's threads and abort
 
 
 def catch_signals(rank):
@@ -490,20 +500,24 @@ def train(args, settings):
     A stop does not wait for the update under way, which can take minutes with --paper: it is given
     up, and the run is saved as it was before it.
     """
-    rank, ranks = join_ranks()
-    catch_signals(rank)
-    learner = make_learner(args, settings, ranks)
-    run = Run(args, settings, ranks, learner)
-    if args.resume:                      # every rank reads the file: spawn would share the tensors
-        run.restore()
-    if rank == 0:
-        run.open_files()
-    before = copy.deepcopy(run.checkpoint())
+    ranks, before = int(os.environ.get("WORLD_SIZE", 1)), None
     try:
+        rank = join_ranks(ranks)
+        catch_signals(rank)
+        learner = make_learner(args, settings, ranks)
+        run = Run(args, settings, ranks, learner)
+        if args.resume:                  # every rank reads the file: spawn would share the tensors
+            run.restore()
+        if rank == 0:
+            run.open_files()
+        before = copy.deepcopy(run.checkpoint())
         while run.update < run.updates:
             one_update(run, rank)
             before = copy.deepcopy(run.checkpoint())
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:            # in rank 0 alone
+        if before is None:
+            print("stopped before the first update")
+            leave_ranks(ranks, stopped=True)
         run.save(before)
     stopped = before["update"] < run.updates
     if rank == 0:
@@ -518,6 +532,14 @@ def fail(message, status=2):
     """End with one line and status 2, as argparse does."""
     print(f"{os.path.basename(sys.argv[0])}: error: {message}", file=sys.stderr)
     sys.exit(status)
+
+
+def positive(text):
+    """An integer >= 1, as argparse's `type`."""
+    number = int(text)
+    if number < 1:
+        raise ValueError
+    return number
 
 
 def read_command(argv=None):
@@ -540,7 +562,8 @@ def read_command(argv=None):
     add("--out", metavar="DIR", help="run folder (default runs/TASK-ENCODER-nN-seedS)")
     add("--paper", action="store_true",
         help="the paper's numbers; where it prints none, its sources' or a guess")
-    add("--set", nargs="+", default=[], metavar="NAME=VALUE", help="change some of SETTINGS")
+    add("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE",
+        help="change some of SETTINGS")
     add("--resume", action="store_true", help="go on from the run folder's checkpoint")
     add("--overwrite", action="store_true", help="start anew in a folder that holds a run")
     add("--ranks", type=int, metavar="R",
@@ -551,8 +574,8 @@ def read_command(argv=None):
     if args.out is None:
         name = f"{args.task}-{args.encoder}-n{args.distractors}-seed{args.seed}"
         args.out = os.path.join("runs", name)
-    if args.seed < 0:
-        fail(f"--seed must be an integer >= 0, got {args.seed}")
+    if not 0 <= args.seed < 2 ** 32:
+        fail(f"--seed must be an integer from 0 to 2^32 - 1, got {args.seed}")
     if args.resume and args.overwrite:
         fail("--resume goes on with a run, --overwrite starts anew: give one of them")
     if "WORLD_SIZE" in os.environ:       # started by torchrun
@@ -645,19 +668,29 @@ def check_folder(args):
              f"anew, or choose another --out")
 
 
+def cores():
+    """Number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):                       # fewer than there are on a cluster
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count()
+
+
 def choose_ranks(settings):
     """One rank per core, or as many as divide environments and batch."""
     def divide(ranks):
         envs, rest = divmod(settings["envs"], ranks)
         return rest == 0 and envs * settings["steps"] % settings["minibatches"] == 0
 
-    return max(filter(divide, range(1, os.cpu_count() + 1)), default=1)
+    return max(filter(divide, range(1, cores() + 1)), default=1)
 
 
 def check_parts(args, settings):
     """Let environment, agent and learner check their own arguments, and the folder be made."""
     if args.ranks < 1 or settings["envs"] % args.ranks:
         fail(f"--ranks {args.ranks} must divide the number of environments, {settings['envs']}")
+    if settings["steps"] < settings["episode_steps"]:
+        fail(f"rollouts of steps={settings['steps']} never see the end of an episode of "
+             f"episode_steps={settings['episode_steps']}")
     try:
         make_env(args.task, args.distractors, settings).close()
         agent = Agent(args.encoder, args.distractors, settings)
@@ -702,8 +735,10 @@ def main():
         port = probe.getsockname()[1]
     os.environ.update(RANK="0", WORLD_SIZE=str(args.ranks), MASTER_ADDR="127.0.0.1",
                       MASTER_PORT=str(port))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)               # the others inherit it
     others = mp.start_processes(start_rank, (args, settings), args.ranks - 1, join=False,
                                 daemon=True, start_method="spawn")
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         train(args, settings)
     except RuntimeError as error:        # a rank that is gone breaks the others' connections

@@ -21,7 +21,7 @@ import torch
 
 PARENT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 sys.path.insert(0, PARENT)
-from train import DEFAULTS, Agent, fail, make_env
+from train import DEFAULTS, Agent, fail, make_env, positive
 
 try:
     from stable_baselines3 import PPO
@@ -78,8 +78,8 @@ def speed_of_this(updates, envs):
 
 def main():
     parser = argparse.ArgumentParser(description="Frames a second against Stable-Baselines3.")
-    parser.add_argument("--updates", type=int, default=4, metavar="U")
-    parser.add_argument("--envs", type=int, default=DEFAULTS["envs"], metavar="E")
+    parser.add_argument("--updates", type=positive, default=4, metavar="U")
+    parser.add_argument("--envs", type=positive, default=DEFAULTS["envs"], metavar="E")
     args = parser.parse_args()
     if args.envs % DEFAULTS["minibatches"]:
         fail(f"--envs must be a multiple of {DEFAULTS['minibatches']}, the number of minibatches")

@@ -16,6 +16,7 @@ import numpy as np
 import pybullet as pb
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+from train import positive
 from trifinger_env import (CUBE, FINGER_YAW, LOWER, UPPER, TriFingerEnv,
                            inverse_kinematics, yaw_quaternion)
 
@@ -74,7 +75,8 @@ def share_held(mass, friction, tries):
 
 def main():
     parser = argparse.ArgumentParser(description="Scripted grasps by mass and friction.")
-    parser.add_argument("--tries", type=int, default=60, metavar="T", help="per cell (default 60)")
+    parser.add_argument("--tries", type=positive, default=60, metavar="T",
+                        help="per cell (default 60)")
     tries = parser.parse_args().tries
     print("share held | friction 0.1 | 0.3 | 0.5 | 1.0")
     for mass in (0.08, 0.02):

@@ -24,7 +24,7 @@ HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path.insert(0, os.path.dirname(HERE))
 import evaluate
 from figures import KINDS, PAPER
-from train import fail, load
+from train import fail, load, positive
 from trifinger_env import IDENTIFIER, TIME
 
 LOOKS = 5                                # moments of an episode that t-SNE gets to see
@@ -173,7 +173,7 @@ def main():
     parser = argparse.ArgumentParser(description="Numbers behind figures 6, 7 and 8.")
     parser.error = fail
     parser.add_argument("figures", nargs="*", help=f"of {', '.join(FIGURES)} (default: all)")
-    parser.add_argument("--episodes", type=int, default=200, metavar="E", help="default 200")
+    parser.add_argument("--episodes", type=positive, default=200, metavar="E", help="default 200")
     args = parser.parse_args()
     for figure in args.figures:
         if figure not in FIGURES:

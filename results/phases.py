@@ -20,7 +20,7 @@ import torch
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import evaluate
 from scripted_lift import bands
-from train import fail, load
+from train import fail, load, positive
 from trifinger_env import SOLVED
 
 COLUMNS = ("success", "strict", "best", "reached", "raised", "above", "placed", "kept")
@@ -76,7 +76,7 @@ def main():
     parser.error = fail
     parser.add_argument("runs", nargs="+", metavar="RUN")
     parser.add_argument("--distractors", type=int, default=2, metavar="N", help="default 2")
-    parser.add_argument("--episodes", type=int, default=200, metavar="E", help="default 200")
+    parser.add_argument("--episodes", type=positive, default=200, metavar="E", help="default 200")
     args = parser.parse_args()
     torch.set_num_threads(1)
     print("run | N | goal's height | episodes | " + " | ".join(COLUMNS))

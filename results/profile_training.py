@@ -17,7 +17,7 @@ import torch
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from ppo import PPO
-from train import make_learner, read_command, read_settings
+from train import make_learner, positive, read_command, read_settings
 from trifinger_env import TriFingerEnv
 
 spent = {}                               # name of a function -> seconds spent in it
@@ -56,7 +56,7 @@ def train(updates, learner):
 
 def main():
     parser = argparse.ArgumentParser(description="Where the time of training goes.")
-    parser.add_argument("--updates", type=int, default=10, metavar="U")
+    parser.add_argument("--updates", type=positive, default=10, metavar="U")
     parser.add_argument("--paper", action="store_true", help="the paper's settings")
     args = parser.parse_args()
     command = read_command(["--paper"] if args.paper else [])

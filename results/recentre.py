@@ -19,7 +19,7 @@ import torch
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import inside
-from train import fail, load, save
+from train import fail, load, positive, save
 
 FIRST = 10_000                           # number of the first episode: far from evaluate.py's
 
@@ -62,7 +62,7 @@ def main():
     parser.error = fail
     parser.add_argument("run", metavar="RUN", help="run folder of an LRN agent")
     parser.add_argument("out", metavar="DIR", help="folder for the changed checkpoint")
-    parser.add_argument("--episodes", type=int, default=25, metavar="E", help="default 25")
+    parser.add_argument("--episodes", type=positive, default=25, metavar="E", help="default 25")
     args = parser.parse_args()
     torch.set_num_threads(1)
     try:

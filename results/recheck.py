@@ -15,7 +15,7 @@ import numpy as np
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import evaluate
 from figures import read, shipped_runs
-from train import fail
+from train import fail, positive
 
 FIRST = 1000                             # number of the first of the other episodes
 NUMBERS = (2, 9)                         # of distractors
@@ -47,7 +47,7 @@ def main():
     parser = argparse.ArgumentParser(
         description="Play shipped agents in other episodes (see the first lines of recheck.py).")
     parser.add_argument("runs", nargs="*", metavar="RUN", help="default: five of the shipped ones")
-    parser.add_argument("--episodes", type=int, default=200, metavar="E", help="default 200")
+    parser.add_argument("--episodes", type=positive, default=200, metavar="E", help="default 200")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the choice")
     args = parser.parse_args()
     shipped = np.random.default_rng(args.seed).permutation(shipped_runs())

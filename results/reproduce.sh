@@ -87,8 +87,7 @@ one_run() {
         resume=--resume
     fi
     echo "$name: $*" | tee -a "$log"
-    if ! python train.py "$@" --ranks 1 --out "runs/$name" $resume >> "$log" 2>&1 ||
-            ! tail -n 1 "$log" | grep -q "^finished"; then
+    if ! python train.py "$@" --ranks 1 --out "runs/$name" $resume >> "$log" 2>&1; then
         echo "$name: not finished, see $log"
         exit 255                                               # xargs starts no other run then
     fi
@@ -110,26 +109,35 @@ one_run() {
     echo "$name: done"
 }
 
+fail() {
+    echo "reproduce.sh: error: $1" >&2
+    exit 2
+}
+
 jobs=1
 list=
-pattern=.
+patterns=()
 while [ $# -gt 0 ]; do
     case $1 in
         --one) shift; one_run "$@"; exit ;;
-        --jobs) jobs=$2; shift 2 ;;
+        --jobs) jobs=${2-}; shift $(($# > 1 ? 2 : 1)) ;;
         --list) list=yes; shift ;;
-        -*) echo "reproduce.sh: error: no option $1, only --list and --jobs" >&2; exit 2 ;;
-        *) pattern=$1; shift ;;
+        -*) fail "no option $1, only --list and --jobs" ;;
+        *) patterns+=("$1"); shift ;;
     esac
 done
+[[ $jobs =~ ^[1-9][0-9]*$ ]] || fail "--jobs needs a number of runs"
+[ ${#patterns[@]} -le 1 ] || fail "one pattern, got ${patterns[*]}: \"a|b\" names both"
+rows=$(all_runs | awk -v pattern="${patterns[0]:-.}" '$1 ~ pattern')
+[ "$rows" ] || fail "no run's name matches ${patterns[0]}"
 if [ "$list" ]; then
-    all_runs | awk -v pattern="$pattern" '$1 ~ pattern' | while read -r name arguments; do
+    while read -r name arguments; do
         printf "%-30s %-24s %s\n" "$name" "$(state_of "$name")" "$arguments"
-    done
+    done <<< "$rows"
     exit
 fi
-all_runs | awk -v pattern="$pattern" '$1 ~ pattern' | while read -r name arguments; do
+while read -r name arguments; do
     if [ "$(state_of "$name")" != "done" ]; then
         echo "$name $arguments"
     fi
-done | xargs -r -P "$jobs" -L 1 results/reproduce.sh --one
+done <<< "$rows" | xargs -r -P "$jobs" -L 1 results/reproduce.sh --one

@@ -15,6 +15,7 @@ import numpy as np
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from grasp import joint_angles
+from train import positive
 from trifinger_env import CUBE, LOWER, SOLVED, UPPER, TriFingerEnv
 
 AROUND, PRESSED = 0.08, CUBE / 2 - 0.02                        # tips' distance from the middle, m
@@ -71,7 +72,7 @@ def bands(heights):
 
 def main():
     parser = argparse.ArgumentParser(description="LiftingCube by inverse kinematics.")
-    parser.add_argument("--episodes", type=int, default=200, metavar="E", help="default 200")
+    parser.add_argument("--episodes", type=positive, default=200, metavar="E", help="default 200")
     episodes = parser.parse_args().episodes
     env = TriFingerEnv("lift", 0)
     rows = []

@@ -6,7 +6,7 @@
 A checkpoint keeps the weights and loses the optimiser: it can be evaluated, not trained on. A CSV
 with more than 300 rows is thinned: each row then stands for a window of updates, with the window's
 last update, frames, seconds and lr, the sum of its episodes and the mean of everything else.
-zeroshot.csv files are copied as they are.
+zeroshot.csv files are copied as they are. A run that is shipped already is refused.
 """
 import argparse
 import csv
@@ -59,6 +59,8 @@ def thin_file(source, target):
 def ship(run, folder):
     """Copy a run: checkpoint without optimiser, thinned curves, scores."""
     checkpoint, _ = load(run)
+    if os.path.exists(os.path.join(folder, "zeroshot.csv")):
+        raise ValueError(f"{folder} holds a run already: remove it first")
     os.makedirs(folder, exist_ok=True)
     small = {name: value for name, value in checkpoint.items() if name != "optimizer"}
     save(small, os.path.join(folder, "checkpoint.pt"))
