@@ -3454,6 +3454,20 @@ def test_reproduce_lists_what_a_pattern_names_and_refuses_unknown_options():
         assert refused.returncode == 2 and len(refused.stderr.splitlines()) == 1, words
 
 
+def test_reproduce_does_not_take_a_run_of_somebody_else_for_its_own(tmp_path):
+    """Such as a short trial that train.py put into its default folder."""
+    (tmp_path / "results").mkdir()
+    shutil.copy(os.path.join(HERE, "results", "reproduce.sh"), tmp_path / "results")
+    run_folder = tmp_path / "runs" / "push-lrn-n2-seed0"
+    run_folder.mkdir(parents=True)
+    (run_folder / "checkpoint.pt").touch()
+    (run_folder / "progress.csv").write_text("update,frames\n1,4000\n")
+    done = subprocess.run(["bash", "results/reproduce.sh", "push-lrn-n2-seed0"], cwd=tmp_path,
+                          capture_output=True, text=True)
+    assert done.returncode != 0 and "not begun by this script" in done.stderr
+    assert not (tmp_path / "runs" / "push-lrn-n2-seed0.log").exists()
+
+
 def test_a_recentred_lrn_is_the_same_at_its_n_and_ignores_constant_distractors(results_scripts):
     import recentre
 

@@ -84,6 +84,7 @@ one_run() {
     mkdir -p runs
     resume=
     if [ -e "runs/$name/checkpoint.pt" ]; then
+        [ -e "$log" ] || fail "runs/$name was not begun by this script: move it away"
         resume=--resume
     fi
     echo "$name: $*" | tee -a "$log"
