@@ -45,7 +45,8 @@ class LRN(nn.Module):
 
     token_dim    D
     z_dim        Z (the paper: 25)
-    relations    False: no relations, r_i = g_theta(o_i) (ablation of figure 5, purple)
+    relations    False: no relations, r_i = g_theta(o_i) (ablation of figure 5, purple). As printed,
+                 over the K objects: z then knows nothing of the goal
     layer_norm   False: z = f_phi(mean_i r_i), a mean in place of sum and LayerNorm (orange)
     """
 
