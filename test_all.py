@@ -3432,7 +3432,7 @@ def test_every_shipped_run_has_its_command():
         arguments = words[words.index("--task"):]
         plain, seed = train.read_command(arguments).out.rsplit("-", 1)
         assert name.endswith(f"-{seed}")
-        if "--set" in arguments or "--frames" in arguments:    # a word says what is different
+        if {"--set", "--frames", "--paper"} & set(arguments):  # a word says what is different
             assert os.path.join("runs", name).startswith(f"{plain}-")
         else:
             assert os.path.join("runs", name) == f"{plain}-{seed}"

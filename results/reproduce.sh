@@ -61,6 +61,7 @@ all_runs() {
             a_run push lrn 2 $seed rawvalues --set normalize_values=False
             a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
             a_run push lrn 2 $seed absolute --set action_mode=absolute
+            a_run push lrn 2 $seed paper --paper                # the printed recipe, 60 M frames
             a_run push lrn 9 $seed
             a_run lift lrn 0 $seed
         fi
