@@ -17,7 +17,7 @@ import torch
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import evaluate
 from train import fail, load, make_env, positive
-from trifinger_env import IDENTIFIER
+from trifinger_env import IDENTIFIER, IDENTIFIERS
 
 
 def distractor_tokens(obs):
@@ -101,7 +101,7 @@ def main():
     parser = argparse.ArgumentParser(
         description="Weigh distractors as in training (see the first lines of reweigh.py).")
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder of LRN, RN or ATTN")
-    parser.add_argument("--distractors", type=int, choices=range(21), metavar="N",
+    parser.add_argument("--distractors", type=int, choices=range(len(IDENTIFIERS)), metavar="N",
                         help="N (default 9; for a run trained at 9: 2)")
     parser.add_argument("--episodes", type=positive, default=100, metavar="E")
     args = parser.parse_args()
