@@ -281,8 +281,14 @@ def save_rows(path, rows):
     print(f"wrote {path}")
 
 
-def check_csv(path):
-    """ValueError if a file is in the way that is not a zeroshot.csv: refused before the play."""
+def check_csv(run, name):
+    """ValueError, before anything is played, if RUN/NAME cannot take the rows.
+
+    That is if `run` is not a folder, or if a file is in the way that is not a zeroshot.csv.
+    """
+    if not os.path.isdir(run):
+        raise ValueError(f"--save needs a run folder to write to, {run} is a file")
+    path = os.path.join(run, name)
     if not os.path.exists(path):
         return
     with open(path, newline="") as file:
@@ -408,10 +414,8 @@ def sweep(args):
     for run in args.runs:
         checkpoint, _ = load(run)
         make_env(checkpoint["task"], numbers[-1], checkpoint["settings"]).close()
-        if args.save and not os.path.isdir(run):
-            fail(f"--save needs a run folder to write to, {run} is a file")
         if args.save:
-            check_csv(os.path.join(run, name))
+            check_csv(run, name)
     for run in args.runs:
         rows = evaluate(run, numbers, args.episodes, args.sample_actions)
         if args.save and rows:

@@ -3125,7 +3125,7 @@ def test_rows_are_saved_in_order_and_other_n_stay(tmp_path):
         return {**dict.fromkeys(evaluate.COLUMNS, value), "distractors": n, "episodes": 7}
 
     evaluate.save_rows(path, [row(9, 0.25), row(2, 0.5)])
-    evaluate.check_csv(path)
+    evaluate.check_csv(tmp_path, "zeroshot.csv")
     evaluate.save_rows(path, [row(2, 0.75), row(0, 1 / 3)])
     lines = read(path).decode().splitlines()
     assert lines == [",".join(evaluate.COLUMNS), "0,7" + 11 * ",0.3333", "2,7" + 11 * ",0.7500",
