@@ -15,6 +15,7 @@ import math
 
 import torch
 from torch import nn
+from torch.nn.functional import pad
 
 
 def orthogonal(layer, gain=math.sqrt(2)):
@@ -80,8 +81,7 @@ class ATTN(nn.Module):
         # softmax(q k^T / sqrt(D/H)) v
         score = q @ k.transpose(2, 3) / math.sqrt(q.shape[-1])             # (B, H, K+1, K+1)
         if present is not None:
-            goal_is_real = present.new_ones(len(present), 1)   # (B, 1) bool
-            real = torch.cat([present, goal_is_real], dim=1)   # (B, K+1)
+            real = pad(present, (0, 1), value=True)            # (B, K+1), the goal is real
             score = score.masked_fill(~real[:, None, None], -math.inf)
         weights = score.softmax(dim=-1)                        # (B, H, K+1, K+1)
         per_head = weights @ v                                 # (B, H, K+1, D/H)
@@ -96,8 +96,8 @@ class ATTN(nn.Module):
         """
         attended, _ = self.attend(objects, goal, present)      # (B, K+1, D)
         if present is not None:                                # padding looked at others: drop it
-            of_objects = attended[:, :-1].masked_fill(~present[..., None], 0.0)
-            attended = torch.cat([of_objects, attended[:, -1:]], dim=1)
+            real = pad(present, (0, 1), value=True)            # (B, K+1)
+            attended = attended.masked_fill(~real[..., None], 0.0)
         total = attended.sum(dim=1)                            # (B, D), sum_i o_attn_i
         return self.norm(self.f(total))                        # (B, Z), LayerNorm(f_phi(.))
 

@@ -20,7 +20,6 @@ import shutil
 import signal
 import tempfile
 import time
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -35,26 +34,28 @@ COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", 
            "read_error")
 CHUNK = 25                               # episodes side by side; another number may change bits
 EVALUATION = 20220131                    # keeps these seeds apart from training's
+STARTS, NOISE = 0, 1                     # what an episode draws: see derived_seed()
+PICTURE = 0.08                           # s between two pictures of a film
 
 
 class Episode(NamedTuple):
     """What one episode came to."""
-    rho: float                           # fractional success at the last step, axis-aligned
-    strict: float                        # the same by true volumes
+    success_aabb: float                  # fractional success at the last step, axis-aligned
+    success_strict: float                # the same by true volumes
     cut_short: bool                      # ended for another reason than time
     blocked: bool                        # a distractor stood in the way at the start
-    drift: float                         # of z at the start, see first_look()
-    read_error: float                    # m, see first_look()
+    z_drift: float                       # at the start, see drift_of()
+    read_error: float                    # m, at the start, see read_errors()
 
 
 def episode_seed(episode):
     """Seed of evaluation episode `episode`."""
-    return derived_seed(EVALUATION, episode)
+    return derived_seed(EVALUATION, episode, STARTS)
 
 
 def is_target(obs):
-    """(N+1,) bool: which cube does the goal name?"""
-    return obs["cubes"][:, IDENTIFIER] == obs["goal"][IDENTIFIER]
+    """(..., N+1) bool: which cube does the goal name? Of one observation or of a batch."""
+    return obs["cubes"][..., IDENTIFIER] == obs["goal"][..., IDENTIFIER, None]
 
 
 def is_blocked(obs):
@@ -82,47 +83,43 @@ def as_batch(observations):
             for key in observations[0]}
 
 
-def start(checkpoint, agent, distractors, seeds):
-    """Environments, their first observations and z (B, Z) of these."""
-    envs = [make_env(checkpoint["task"], distractors, checkpoint["settings"]) for _ in seeds]
-    observations = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds)]
-    return envs, observations, agent.encode(as_batch(observations))
+def start(checkpoint, distractors, episodes):
+    """Environments at the start of these episodes, and their observations."""
+    envs = [make_env(checkpoint["task"], distractors, checkpoint["settings"]) for _ in episodes]
+    observations = [env.reset(seed=episode_seed(episode))[0]
+                    for env, episode in zip(envs, episodes)]
+    return envs, observations
 
 
-@lru_cache                               # a worker meets the same episodes again at every N
-def trained_z(path, first, count):
+def trained_z(checkpoint, agent, episodes):
     """z (B, Z) at the start of these episodes at the N of training."""
-    checkpoint, agent = load(path)
-    seeds = [episode_seed(first + e) for e in range(count)]
-    envs, _, z = start(checkpoint, agent, checkpoint["distractors"], seeds)
+    envs, observations = start(checkpoint, checkpoint["distractors"], episodes)
     for env in envs:
         env.close()
-    return z
+    return agent.encode(as_batch(observations))
 
 
-def first_look(agent, observations, z, z_trained, has_read_out):
-    """Two measures of z at the start of B episodes, lists of B numbers each.
+def drift_of(z, z_trained):
+    """Distances of z (B, Z) from z_trained (B, Z), over the mean between two rows of that: (B,).
 
-    drift        distance from the z of the same episode at the training N, over the mean distance
-                 between different episodes there (NaN if there is one episode only). Identifiers
-                 are drawn after the distractors, so they differ at another N and move z, too
-    read_error   distance (m) from the target cube to where the agent's read-out sees it; NaN if it
-                 was trained without one
+    Identifiers are drawn after the distractors, so they differ at another N and move z, too. NaN
+    for a single row.
     """
-    B = len(observations)
+    B = len(z)
     spread = torch.cdist(z_trained, z_trained).sum() / (B * (B - 1))
-    drift = (z - z_trained).norm(dim=1) / spread
-    if not has_read_out:
-        return drift.tolist(), [float("nan")] * B
+    return (z - z_trained).norm(dim=1) / spread
+
+
+def read_errors(agent, observations, z):
+    """Distances (m) from the target cube to where the agent's read-out sees it: (B,)."""
     targets = np.stack([obs["cubes"][is_target(obs)][0, POSITION] for obs in observations])
     seen = agent.read_out(z)[:, :3]
-    error = (seen - torch.from_numpy(targets)).norm(dim=1) * POSITION_SCALE
-    return drift.tolist(), error.tolist()
+    return (seen - torch.from_numpy(targets)).norm(dim=1) * POSITION_SCALE
 
 
 def noise_of(episodes):
     """One generator of action noise per episode, independent of the one that places the cubes."""
-    return [np.random.default_rng(derived_seed(EVALUATION, episode, 1)) for episode in episodes]
+    return [np.random.default_rng(derived_seed(EVALUATION, episode, NOISE)) for episode in episodes]
 
 
 def actions(agent, observations, generators=None):
@@ -139,6 +136,7 @@ def to_the_end(agent, envs, observations, generators=None):
     """Play every environment until its episode ends; the info of each last step."""
     ends = [None] * len(envs)
     while None in ends:
+        # Ended ones go on in the batch: its size decides bits.
         chosen = actions(agent, observations, generators)
         for e, action in enumerate(chosen):
             if ends[e] is None:
@@ -149,25 +147,35 @@ def to_the_end(agent, envs, observations, generators=None):
 
 
 @torch.inference_mode()
-def play(path, distractors, first, count, sample_actions):
-    """Play episodes first .. first+count-1 of the agent in `path`: a list of Episodes."""
-    torch.set_num_threads(1)
-    checkpoint, agent = load(path)
-    episodes = range(first, first + count)
-    seeds = [episode_seed(episode) for episode in episodes]
-    envs, observations, z = start(checkpoint, agent, distractors, seeds)
-    has_read_out = checkpoint["settings"]["auxiliary"] > 0
-    z_trained = trained_z(path, first, count)
-    drift, read_error = first_look(agent, observations, z, z_trained, has_read_out)
+def play(checkpoint, agent, distractors, episodes, sample_actions):
+    """Play `episodes` (a range) side by side: a list of Episodes."""
+    envs, observations = start(checkpoint, distractors, episodes)
     blocked = [is_blocked(obs) for obs in observations]
+    z = agent.encode(as_batch(observations))
+    drift = drift_of(z, trained_z(checkpoint, agent, episodes)).tolist()
+    error = [float("nan")] * len(episodes)
+    if checkpoint["settings"]["auxiliary"] > 0:                # trained with a read-out
+        error = read_errors(agent, observations, z).tolist()
+
     generators = noise_of(episodes) if sample_actions else None
     ends = to_the_end(agent, envs, observations, generators)
     for env in envs:
         env.close()
-    return [Episode(rho=info["fractional_success"], strict=info["fractional_success_strict"],
-                    cut_short=info["truncated_by"] != TIME, blocked=is_in_way, drift=moved,
-                    read_error=error)
-            for info, is_in_way, moved, error in zip(ends, blocked, drift, read_error)]
+    return [Episode(
+        success_aabb=info["fractional_success"],
+        success_strict=info["fractional_success_strict"],
+        cut_short=info["truncated_by"] != TIME,
+        blocked=blocked[e],
+        z_drift=drift[e],
+        read_error=error[e],
+    ) for e, info in enumerate(ends)]
+
+
+def play_chunk(arguments):
+    """play() in a process of its own, which has to load the agent anew."""
+    path, *task = arguments
+    torch.set_num_threads(1)
+    return play(*load(path), *task)
 
 
 # ---- the sweep over N
@@ -187,7 +195,8 @@ def mean_or_nan(values):
 def summary(distractors, episodes):
     """One row of zeroshot.csv: means over episodes, with 95 % intervals."""
     column = dict(zip(Episode._fields, np.array(episodes, float).T))
-    rho, strict = column["rho"], column["strict"]
+    rho, strict = column["success_aabb"], column["success_strict"]
+    drift = column["z_drift"]
     is_clear = column["blocked"] == 0
     return {
         "distractors": distractors,
@@ -201,7 +210,7 @@ def summary(distractors, episodes):
         "blocked": column["blocked"].mean(),
         "success_clear": mean_or_nan(rho[is_clear]),
         "success_blocked": mean_or_nan(rho[~is_clear]),
-        "z_drift": mean_or_nan(column["drift"][~np.isnan(column["drift"])]),
+        "z_drift": mean_or_nan(drift[~np.isnan(drift)]),
         "read_error": column["read_error"].mean(),
     }
 
@@ -220,49 +229,51 @@ def print_row(row, seconds_left):
           f"{row['z_drift']:11.3f} {1000 * row['read_error']:16.1f}  {left}", flush=True)
 
 
-def evaluate(run, distractors, episodes, sample_actions=False):
-    """Play `episodes` episodes at every N in `distractors` on all cores.
+def evaluate(run, numbers, episodes, sample_actions=False):
+    """Play `episodes` episodes at every N in `numbers` on all cores.
 
     Prints and returns rows, each as soon as its N is done. A copy of the checkpoint is played, as a
     run that is still being trained replaces its own.
     """
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy(checkpoint_file(run), folder)
-        return evaluate_copy(folder, run, distractors, episodes, sample_actions)
+        checkpoint, _ = load(folder)
+        numbers = playable(run, checkpoint, numbers)
+        if not numbers:
+            return []
+        print(f"{run}: {checkpoint['encoder']} trained on {checkpoint['task']} with "
+              f"{checkpoint['distractors']} distractors, {checkpoint['frames']} frames; "
+              f"{episodes} episodes each, {'sampled' if sample_actions else 'mean'} actions")
+        print(HEADER, flush=True)
+        return play_all(folder, numbers, range(episodes), sample_actions)
 
 
-def evaluate_copy(path, run, distractors, episodes, sample_actions):
-    """Rows of the agent in `path`; `run` is the name to print."""
-    checkpoint, _ = load(path)
+def playable(run, checkpoint, numbers):
+    """Those of the `numbers` of distractors that the agent can play at all."""
     trained = checkpoint["distractors"]
-    if checkpoint["encoder"] == "mlp" and distractors != [trained]:
-        print(f"{run}: an mlp has a fixed input, so it can be played at its own N = {trained} only")
-        distractors = [n for n in distractors if n == trained]
-    if not distractors:
-        return []
-    print(f"{run}: {checkpoint['encoder']} trained on {checkpoint['task']} with {trained} "
-          f"distractors, {checkpoint['frames']} frames; {episodes} episodes each, "
-          f"{'sampled' if sample_actions else 'mean'} actions")
-    print(HEADER, flush=True)
-    parts = chunks(range(episodes))
-    tasks = [(path, n, part[0], len(part), sample_actions) for n in distractors for part in parts]
+    if checkpoint["encoder"] != "mlp" or numbers == [trained]:
+        return numbers
+    print(f"{run}: an mlp has a fixed input, so it can be played at its own N = {trained} only")
+    return [n for n in numbers if n == trained]
+
+
+def play_all(path, numbers, episodes, sample_actions):
+    """Rows of the agent in `path`, chunk by chunk on all cores."""
+    parts = chunks(episodes)
+    tasks = [(path, n, part, sample_actions) for n in numbers for part in parts]
     context = multiprocessing.get_context("spawn")
     rows, begin = [], time.monotonic()
     # Ctrl-C is for the main process alone: leaving the pool ends the others.
     with context.Pool(min(cores(), len(tasks)), initializer=signal.signal,
                       initargs=(signal.SIGINT, signal.SIG_IGN)) as pool:
         results = pool.imap(play_chunk, tasks)                 # in order, as they are done
-        for n in distractors:
+        for n in numbers:
             played = [episode for _ in parts for episode in next(results)]
             rows.append(summary(n, played))
-            share = len(rows) / len(distractors)
+            share = len(rows) / len(numbers)
             elapsed = time.monotonic() - begin
             print_row(rows[-1], elapsed / share - elapsed)
     return rows
-
-
-def play_chunk(arguments):
-    return play(*arguments)
 
 
 def save_rows(path, rows):
@@ -307,7 +318,7 @@ def play_live(agent, env, episode, sample_actions):
     yield info
     truncated = False
     while not truncated:
-        action, = actions(agent, [obs], generators)
+        [action] = actions(agent, [obs], generators)
         obs, _, _, truncated, info = env.step(action)
         yield info
 
@@ -335,21 +346,22 @@ def watch(run, distractors, episodes, sample_actions):
 
 
 @torch.inference_mode()
-def film(run, distractors, sample_actions, path, episode=0):
-    """Write one evaluation episode as an animated GIF."""
+def film(run, distractors, sample_actions, path):
+    """Write the first evaluation episode as an animated GIF."""
     try:
         from PIL import Image
     except ImportError:
         raise ValueError("--gif needs pillow: pip install pillow") from None
     checkpoint, agent = load(run)
     env = make_env(checkpoint["task"], distractors, checkpoint["settings"], "rgb_array")
-    every = max(1, round(0.08 / (env.substeps * env.timestep)))            # 12 pictures a second
+    every = max(1, round(PICTURE / (env.substeps * env.timestep)))
     pictures = []
-    for step, info in enumerate(play_live(agent, env, episode, sample_actions)):
+    for step, info in enumerate(play_live(agent, env, 0, sample_actions)):
         if step % every == 0:
             pictures.append(Image.fromarray(env.render(320, 240)))
     env.close()
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=80, loop=0)
+    pictures[0].save(path, save_all=True, append_images=pictures[1:],
+                     duration=round(1000 * PICTURE), loop=0)
     print(f"wrote {path}: {distractors} distractors, fractional success "
           f"{info['fractional_success']:.2f}")
 
@@ -362,7 +374,8 @@ def parse_range(text):
     try:
         for part in text.split(","):
             low, _, high = part.partition("-")
-            numbers.update(range(int(low), min(int(high or low), len(IDENTIFIERS)) + 1))
+            last = min(int(high or low), len(IDENTIFIERS))     # 0-999999999 must not fill memory
+            numbers.update(range(int(low), last + 1))
     except ValueError:
         fail(f"--distractors must look like 0-9 or 0,2,5, got {text!r}")
     if not numbers:

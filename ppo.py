@@ -24,21 +24,21 @@ import torch.distributed as dist
 from torch import nn
 
 
-def gae(rewards, values, next_values, terminated, done, discount, lam):
+def gae(rewards, values, next_values, terminated, is_last, discount, lam):
     """Generalised advantage estimation (Schulman et al., 2016): inputs (T, E) -> advantages (T, E).
 
     next_values[t] is the value of the observation that step t led to. At the end of an episode
     that is its final observation, not the first one of the next episode. After a termination there
     is no future, so delta leaves next_values out; after a truncation there is one, so it keeps
-    them. `done` marks the end of an episode, for either reason, or of the rollout: from there
-    A_{t+1} is not carried back.
+    them. `is_last` marks the end of an episode, for either reason, or of the rollout: from there
+    A_{t+1} is not carried back. (Like `terminated` it holds 0.0 and 1.0.)
     """
     advantages = torch.zeros_like(rewards)
     following = torch.zeros_like(rewards[0])                   # A_{t+1}, (E,)
     for t in reversed(range(len(rewards))):
         # delta_t = r_t + gamma V(s_{t+1}) - V(s_t),   A_t = delta_t + gamma lambda A_{t+1}
         delta = rewards[t] + discount * (1 - terminated[t]) * next_values[t] - values[t]
-        advantages[t] = delta + discount * lam * (1 - done[t]) * following
+        advantages[t] = delta + discount * lam * (1 - is_last[t]) * following
         following = advantages[t]
     return advantages
 
@@ -133,9 +133,9 @@ class PPO(nn.Module):
         """Play T steps in every environment, environment e from reset(seed=seeds[e]).
 
         Starting fresh makes an update a function of weights and seeds alone, which is what lets a
-        run resume exactly. Leaves the batch for update() in self.observations and self.batch.
-        Returns the finished episodes: dicts with "return", "length" and "info", that of the last
-        step.
+        run resume exactly. Leaves the batch for update() in self.observations and self.batch, and
+        self.explained_variance for its diagnostics. Returns the finished episodes: dicts with
+        "return", "length" and "info", that of the last step.
         """
         first = [env.reset(seed=seed)[0] for env, seed in zip(self.envs, seeds)]
         self.make_storage(first[0])
@@ -148,12 +148,12 @@ class PPO(nn.Module):
             values = values * self.return_std() + self.return_mean
             next_values = next_values * self.return_std() + self.return_mean
         advantages = gae(played["rewards"], values, next_values, played["terminated"],
-                         played["done"], self.discount, self.lam)
+                         played["is_last"], self.discount, self.lam)
         returns = advantages + values                          # R, targets of the value network
         # 1 - Var[R - V] / Var[R]
         unexplained = (returns - values).var() / returns.var().clamp(min=1e-8)
         self.explained_variance = 1 - unexplained
-        self.batch = {
+        self.batch = {                                         # by the names of loss()'s arguments
             "actions": played["actions"],
             "old_log_prob": played["log_prob"],
             "advantages": advantages,
@@ -175,9 +175,10 @@ class PPO(nn.Module):
 
         Returns what happened (dict of (T, E, ...) tensors), the final observations
         {(t, e): observation} wherever an episode or the rollout ended, and the finished episodes.
+        Changes `current`.
         """
         T, E = self.steps, len(self.envs)
-        rewards, terminated, done = (np.zeros((T, E), np.float32) for _ in range(3))
+        rewards, terminated, is_last = (np.zeros((T, E), np.float32) for _ in range(3))
         actions, means, values = [], [], []
         final_observations, episodes = {}, []
         total, length = np.zeros(E), np.zeros(E, int)          # of the episodes under way
@@ -194,19 +195,19 @@ class PPO(nn.Module):
                 current[e], reward, terminates, truncated, info = self.envs[e].step(action)
                 rewards[t, e] = reward
                 terminated[t, e] = terminates
-                total[e] += rewards[t, e]
+                total[e] += rewards[t, e]                      # as float32, as it is learned from
                 length[e] += 1
-                over = terminates or truncated
-                if over or t == T - 1:
-                    done[t, e] = True
+                ended = terminates or truncated
+                if ended or t == T - 1:
+                    is_last[t, e] = True
                     final_observations[t, e] = current[e]
-                if over:
+                if ended:
                     episodes.append({"return": total[e], "length": int(length[e]), "info": info})
                     total[e] = length[e] = 0
-                if over and t < T - 1:                         # the next rollout() resets anyway
+                if ended and t < T - 1:                         # the next rollout() resets anyway
                     current[e], _ = self.envs[e].reset()
         played = {name: torch.from_numpy(array) for name, array in
-                  (("rewards", rewards), ("terminated", terminated), ("done", done))}
+                  (("rewards", rewards), ("terminated", terminated), ("is_last", is_last))}
         played["values"] = torch.stack(values)
         played["actions"] = torch.stack(actions)
         played["log_prob"] = normal_log_prob(played["actions"], torch.stack(means), log_std)
@@ -218,9 +219,9 @@ class PPO(nn.Module):
         # kept a final observation for each of those, and its value goes there.
         next_values = values.roll(-1, dims=0)
         observations = final_observations.values()
-        last = {key: torch.from_numpy(np.stack([observation[key] for observation in observations]))
-                for key in self.observations}
-        _, _, value = self.agent(last)
+        finals = {key: torch.from_numpy(np.stack([final[key] for final in observations]))
+                  for key in self.observations}
+        _, _, value = self.agent(finals)
         t, e = torch.tensor(list(final_observations)).T        # its keys are (t, e)
         next_values[t, e] = value
         return next_values

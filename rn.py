@@ -13,7 +13,7 @@ import math
 
 import torch
 from torch import nn
-from torch.nn.functional import linear
+from torch.nn.functional import linear, pad
 
 
 def orthogonal(layer, gain=math.sqrt(2)):
@@ -77,8 +77,7 @@ class RN(nn.Module):
         check_shapes(self.token_dim, objects, goal, present)
         r = self.relations(objects, goal)                      # (B, K+1, K+1, D)
         if present is not None:
-            goal_is_real = present.new_ones(len(present), 1)   # (B, 1) bool
-            real = torch.cat([present, goal_is_real], dim=1)   # (B, K+1)
+            real = pad(present, (0, 1), value=True)            # (B, K+1), the goal is real
             both_real = real[:, :, None] & real[:, None]       # (B, K+1, K+1)
             r = r.masked_fill(~both_real[..., None], 0.0)
         total = r.sum(dim=(1, 2))                              # (B, D), sum_i sum_j r_ij

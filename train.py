@@ -32,7 +32,7 @@ import torch.multiprocessing as mp
 from torch import nn
 
 from attn import ATTN
-from lrn import LRN, LRNMax
+from lrn import LRN, LRNMax, orthogonal
 from ppo import PPO
 from rn import RN
 from trifinger_env import (CUBE_WIDTH, FINGER_WIDTH, FINGERTIP, GOAL_WIDTH, IDENTIFIER,
@@ -55,12 +55,12 @@ SETTINGS = {
     # The environment
     "episode_steps": Setting(125, 2500, "5 s, not 30 s (4.1): more episodes show more goals"),
     "substeps": Setting(5, 3, "25 Hz, not 83.3 (4.1, CW): noise moves further"),
-    "timestep": Setting(0.008, 0.004, "s; CW: 0.004; costs the same, and 8 ms behave (tested)"),
+    "timestep": Setting(0.008, 0.004, "s; CW: 0.004; a step costs as much, and is sound (tested)"),
     "action_mode": Setting("integrated", "absolute", "targets that stay keep a grip; CW: absolute"),
     "action_scale": Setting(0.1, 0.1, "rad, largest step of an action"),
     "cube_mass": Setting(0.08, 0.02, "kg; CW's pushing and picking tasks: 0.02"),
     "finger_friction": Setting(1.0, 0.1, "IsaacGymEnvs; CW: 0.1, which holds no 0.08 kg"),
-    "goal_yaw": Setting(0.0, math.pi / 4, "or a goal asks for the yaw, too (4.1: a pose; CW: any)"),
+    "goal_yaw": Setting(0.0, math.pi / 4, "rad, largest; 0: place alone (4.1: a pose; CW: any)"),
     "reward_overlap": Setting(100.0, 100.0, "alpha_1 (A.1)"),
     "reward_distance": Setting(5000.0, 250.0, "alpha_2 (A.1): as printed, 2 mm are worth 0.5"),
     "reward_curiosity": Setting(0.0, 10.0, "alpha_3 (A.1): never positive, pays for throwing"),
@@ -68,17 +68,17 @@ SETTINGS = {
     # PPO
     "lr": Setting(2e-3, 2.5e-4, "A.2; ours takes fewer frames"),
     "lr_power": Setting(1.0, 1.0, "lr falls as (share of training left) ^ this; A.2: linearly"),
-    "clip": Setting(0.2, 0.5, "A.2"),
+    "clip": Setting(0.2, 0.5, "A.2; ours as usual in PPO"),
     "anneal_clip": Setting(False, True, "rlpyt anneals both"),
-    "epochs": Setting(3, 4, "A.2"),
+    "epochs": Setting(3, 4, "A.2; ours: fewer cost less time"),
     "minibatches": Setting(8, 40, "A.2; of 500 samples by default, of 3000 in the paper"),
     "discount": Setting(0.98, 0.98, "A.2; at 25 Hz it looks 2 s ahead, at 83.3 Hz 0.6 s"),
     "lam": Setting(0.95, 0.95, "A.2"),
     "entropy": Setting(0.001, 0.01, "A.2; with normalised advantages 0.01 lets std grow"),
     "value_coef": Setting(0.5, 0.5, "A.2"),
     "max_grad_norm": Setting(0.5, 0.5, "A.2"),
-    "adam_eps": Setting(1e-5, 1e-8, "rlpyt's default"),
-    "normalize_advantages": Setting(True, False, "rlpyt's default"),
+    "adam_eps": Setting(1e-5, 1e-8, "rlpyt: 1e-8; ours as usual in PPO"),
+    "normalize_advantages": Setting(True, False, "rlpyt: off; ours as usual in PPO"),
     "normalize_values": Setting(True, False, "or large returns drown the policy loss"),
     "auxiliary": Setting(30.0, 0.0, "ours: weight of the read-out loss, see Agent.auxiliary"),
     # The networks
@@ -104,21 +104,19 @@ PROGRESS = ("update", "frames", "episodes", "return", "length", "success_aabb", 
             "solved", "cut_short", "std", "approx_kl", "clip_fraction", "explained_variance",
             "policy_loss", "value_loss", "auxiliary_loss", "entropy", "grad_norm", "lr")
 TIMING = ("update", "frames", "seconds", "frames_per_second", "rollout_share")
+
+# ---- the agent
+
 POOL = torch.tensor(IDENTIFIERS, dtype=torch.float32)
 FACTS = 3 + 3 + 3 + 9                    # what the read-out reads from z, see Agent.auxiliary
 
 
-# ---- the agent
-
 def mlp(*widths, last_gain=math.sqrt(2)):
     """ReLU network through the given widths; orthogonal weights, zero biases, last layer linear."""
+    gains = [math.sqrt(2)] * (len(widths) - 2) + [last_gain]
     layers = []
-    for i, (width, next_width) in enumerate(zip(widths, widths[1:])):
-        is_last = i == len(widths) - 2
-        layer = nn.Linear(width, next_width)
-        nn.init.orthogonal_(layer.weight, last_gain if is_last else math.sqrt(2))
-        nn.init.zeros_(layer.bias)
-        layers += [layer, nn.ReLU()]
+    for width, next_width, gain in zip(widths, widths[1:], gains):
+        layers += [orthogonal(nn.Linear(width, next_width), gain), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 
 
@@ -218,6 +216,8 @@ class Agent(nn.Module):
         return (self.read_out(z) - facts).square().mean()
 
 
+# ---- environments and seeds
+
 def make_env(task, distractors, settings, render_mode=None):
     """The environment of a run."""
     prefix = "reward_"
@@ -237,10 +237,6 @@ def derived_seed(*numbers):
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
-STOPPED = 130                            # exit status after a Ctrl-C, as shells have it
-NOISE_STREAM = 10 ** 6                   # stream e < 10^6: environment e; 10^6 + r: torch on rank r
-
-
 # ---- files of a run
 
 def checkpoint_file(path):
@@ -257,7 +253,7 @@ def load(path):
     path = checkpoint_file(path)
     try:
         checkpoint = torch.load(path, weights_only=True, map_location="cpu")
-        for key in ("task", "seed", "ranks", "update", "frames", "seconds"):
+        for key in ("task", "seed", "ranks", "update", "frames", "seconds"):   # others: below
             if key not in checkpoint:
                 raise KeyError(key)
         checkpoint["settings"] = {**DEFAULTS, **checkpoint["settings"]}
@@ -322,7 +318,7 @@ class Run:
         self.args, self.settings, self.ranks, self.learner = args, settings, ranks, learner
         self.update, self.seconds = 0, 0.0
         self.frames_per_update = settings["envs"] * settings["steps"]
-        self.updates = math.ceil(settings["frames"] / self.frames_per_update)
+        self.last_update = math.ceil(settings["frames"] / self.frames_per_update)
         self.saved_at = time.monotonic()
 
     def path(self, name):
@@ -361,7 +357,7 @@ class Run:
             self.save(self.checkpoint())
         keep_rows(self.path("progress.csv"), PROGRESS, self.update)
         keep_rows(self.path("timing.csv"), TIMING, self.update)
-        if self.update < self.updates:
+        if self.update < self.last_update:
             for name in ("zeroshot.csv", "zeroshot-sampled.csv"):          # of weights that change
                 if os.path.exists(self.path(name)):
                     os.remove(self.path(name))
@@ -382,9 +378,9 @@ class Run:
             "frames_per_second": f"{speed:.0f}",
             "rollout_share": f"{rollout_seconds / elapsed:.3f}",
         })
-        minutes_left = (self.updates - self.update) * elapsed / 60
-        print(f"update {self.update}/{self.updates} "
-              f"frames {row['frames']}/{self.updates * self.frames_per_update} "
+        minutes_left = (self.last_update - self.update) * elapsed / 60
+        print(f"update {self.update}/{self.last_update} "
+              f"frames {row['frames']}/{self.last_update * self.frames_per_update} "
               f"frames/s {speed:.0f} return {row['return']:.1f} "
               f"success {row['success_aabb']:.3f} strict {row['success_strict']:.3f} "
               f"solved {row['solved']:.2f} cut_short {row['cut_short']} "
@@ -394,6 +390,10 @@ class Run:
 
 
 # ---- training
+
+STOPPED = 130                            # exit status after a Ctrl-C, as shells have it
+NOISE_STREAM = 10 ** 6                   # stream e < 10^6: environment e; 10^6 + r: torch on rank r
+
 
 def join_ranks(ranks):
     """Rank of this process, after the ranks have found each other."""
@@ -464,10 +464,10 @@ def episode_sums(episodes):
 
 
 def summarize(sums):
-    """Columns of progress.csv about the episodes of all ranks."""
-    episodes, *_, cut_short = sums.tolist()                    # these two stay sums
+    """Columns of progress.csv about the episodes of all ranks: means, but for two sums."""
+    total = dict(zip(EPISODE_SUMS, sums.tolist()))
     means = dict(zip(EPISODE_SUMS, (sums / sums[0]).tolist()))
-    return {**means, "episodes": int(episodes), "cut_short": int(cut_short)}
+    return {**means, "episodes": int(total["episodes"]), "cut_short": int(total["cut_short"])}
 
 
 def one_update(run, rank):
@@ -478,7 +478,7 @@ def one_update(run, rank):
     episodes = learner.rollout(seeds)
     rollout_seconds = time.monotonic() - begin
     try:
-        stats = learner.update(left=1 - run.update / run.updates)
+        stats = learner.update(left=1 - run.update / run.last_update)
     except FloatingPointError as error:                        # on every rank alike
         fail(f"update {run.update + 1}: {error}; the last checkpoint stays as it was", status=1)
     sums = episode_sums(episodes)
@@ -490,7 +490,7 @@ def one_update(run, rank):
     if rank == 0:
         std = learner.agent.log_std.exp().mean().item()
         run.write({**summarize(sums), "std": std, **stats}, elapsed, rollout_seconds)
-        if run.update == run.updates or run.is_due():
+        if run.update == run.last_update or run.is_due():
             run.save(run.checkpoint())
 
 
@@ -500,7 +500,8 @@ def train(args, settings):
     A stop does not wait for the update under way, which can take minutes with --paper: it is given
     up, and the run is saved as it was before it.
     """
-    ranks, before = int(os.environ.get("WORLD_SIZE", 1)), None
+    ranks = int(os.environ.get("WORLD_SIZE", 1))
+    before = None
     try:
         rank = join_ranks(ranks)
         catch_signals(rank)
@@ -511,7 +512,7 @@ def train(args, settings):
         if rank == 0:
             run.open_files()
         before = copy.deepcopy(run.checkpoint())
-        while run.update < run.updates:
+        while run.update < run.last_update:
             one_update(run, rank)
             before = copy.deepcopy(run.checkpoint())
     except KeyboardInterrupt:            # in rank 0 alone
@@ -519,7 +520,7 @@ def train(args, settings):
             print("stopped before the first update")
             leave_ranks(ranks, stopped=True)
         run.save(before)
-    stopped = before["update"] < run.updates
+    stopped = before["update"] < run.last_update
     if rank == 0:
         print(f"{'stopped' if stopped else 'finished'} after {before['update']} updates, "
               f"{before['seconds'] / 60:.1f} minutes: {run.path('checkpoint.pt')}")
@@ -543,7 +544,7 @@ def positive(text):
 
 
 def read_command(argv=None):
-    """The command's arguments as they were given."""
+    """The command's arguments, with the run folder and torchrun's ranks filled in."""
     parser = argparse.ArgumentParser(
         description="Train an agent with PPO (see the first lines of train.py).")
     parser.error = fail
@@ -649,6 +650,7 @@ def check_resume(args, settings):
     started_with = checkpoint["settings"]
     changed = [f"{name}={started_with[name]}" for name in settings
                if settings[name] != started_with[name]]
+    # A bare --resume takes the run's own settings; those that are named must agree.
     if changed and (args.set or args.paper or args.frames is not None):
         fail(f"--resume: {file} was started with other settings: {', '.join(changed)}")
     if args.ranks not in (None, checkpoint["ranks"]):
@@ -661,6 +663,7 @@ def check_resume(args, settings):
 def check_folder(args):
     """Fail if the run folder holds a run already."""
     rows = os.path.join(args.out, "progress.csv")
+    # An empty progress.csv is what check_parts() leaves.
     has_rows = os.path.exists(rows) and os.path.getsize(rows) > 0
     has_checkpoint = os.path.exists(os.path.join(args.out, "checkpoint.pt"))
     if (has_rows or has_checkpoint) and not args.overwrite:

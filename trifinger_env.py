@@ -45,11 +45,12 @@ JOINTS = (0, 1, 2)
 BASE = 0.0455                            # radius at which fingers are mounted, m
 HEIGHT = 0.34                            # height at which fingers are mounted, m
 LINK = 0.16                              # length of the middle and the lower link, m
-OFFSET = 0.05945                         # how far a fingertip stands beside the finger's plane, m
+OFFSET = 0.05945                         # how far a fingertip stands beside the finger's plane, m:
+                                         # the sideways parts of finger_urdf(), added up
 TIP = 0.0095                             # radius of a finger's lower link and tip, m
 TIP_HALF_EDGE = 0.014                    # of the square that a tip at rest keeps free of cubes, m
-LOWER = (-1.57, -1.2, -3.0)              # limits of upper, middle and lower joint, rad
-UPPER = (1.0, 1.57, 3.0)
+JOINT_LOW = (-1.57, -1.2, -3.0)          # limits of upper, middle and lower joint, rad
+JOINT_HIGH = (1.0, 1.57, 3.0)
 REST = (0.0, 0.55, -0.7)                 # at reset, rad: tips hang beside the cubes, 0.045 m high
 TORQUE = 0.36                            # N m
 LEAD = 0.25                              # rad, how far an integrated target may lead its joint
@@ -207,7 +208,7 @@ def cut(faces, axis, sign):
             kept.append(inside)
     if len(cap) > 2:                                           # close the cut with a face
         spokes = np.array(cap) - np.mean(cap, axis=0)
-        angles = np.arctan2(spokes[:, axis - 1], spokes[:, axis - 2])
+        angles = np.arctan2(spokes[:, axis - 1], spokes[:, axis - 2])      # the two other axes
         kept.append([cap[j] for j in np.argsort(angles)])
     return kept
 
@@ -302,8 +303,8 @@ def finger_urdf():
     Only the lower link can touch things. What is drawn reaches from joint to joint. Lines are kept
     short because PyBullet breaks a line after 1023 characters, wherever that is.
     """
-    knee, tip = (0, -0.03745, -0.16), (0, -0.008, -0.16)       # the lower joint, the fingertip
-    touching = (f'<collision>{origin((0, -0.008, -0.08))}<geometry>'
+    knee, tip = (0, -0.03745, -LINK), (0, -0.008, -LINK)       # the lower joint, the fingertip
+    touching = (f'<collision>{origin((0, -0.008, -LINK / 2))}<geometry>'
                 f'<capsule radius="{TIP}" length="{LINK}"/></geometry></collision>')
     hub = [bar((BASE, 0, 0), (0, 0, 0), 0.018, METAL)]         # from the robot's centre
     upper = [ball((0, 0, 0), 0.021, JOINT_COLOR), bar((0, 0, 0), (-0.10, 0, 0), 0.017, PLASTIC)]
@@ -315,9 +316,9 @@ def finger_urdf():
         link("upper", 0.14854, (-0.079, 0, 0), (3e-5, 4.1e-4, 4.1e-4), upper),
         link("middle", 0.14854, (0, -0.019, -0.079), (4.1e-4, 4.1e-4, 3e-5), middle),
         link("lower", 0.0407, (0, -0.00875, -0.1065), (1.6e-4, 1.6e-4, 1e-5), lower, touching),
-        joint("base", "upper", origin((0, 0, 0)), "-1 0 0", LOWER[0], UPPER[0]),
-        joint("upper", "middle", origin((0, -0.014, 0)), "0 1 0", LOWER[1], UPPER[1]),
-        joint("middle", "lower", origin(knee), "0 1 0", LOWER[2], UPPER[2]),
+        joint("base", "upper", origin((0, 0, 0)), "-1 0 0", JOINT_LOW[0], JOINT_HIGH[0]),
+        joint("upper", "middle", origin((0, -0.014, 0)), "0 1 0", JOINT_LOW[1], JOINT_HIGH[1]),
+        joint("middle", "lower", origin(knee), "0 1 0", JOINT_LOW[2], JOINT_HIGH[2]),
     ]
     return f'<robot name="finger">{"".join(parts)}</robot>'
 
@@ -425,29 +426,31 @@ class TriFingerEnv(Env):
         return pb.createVisualShape(pb.GEOM_BOX, halfExtents=half_extents, rgbaColor=color,
                                     **place, **self._world)
 
-    def _body(self, mass, half_extents, skin, position, quaternion=(0, 0, 0, 1), shape=None):
-        """A box. useMaximalCoordinates: a plain rigid body, which Bullet solves faster."""
-        if shape is None:
-            shape = pb.createCollisionShape(pb.GEOM_BOX, halfExtents=half_extents, **self._world)
+    def _box(self, half_extents):
+        """Collision shape of a box."""
+        return pb.createCollisionShape(pb.GEOM_BOX, halfExtents=half_extents, **self._world)
+
+    def _body(self, mass, shape, skin, position, quaternion=(0, 0, 0, 1)):
+        """A rigid body. useMaximalCoordinates: a plain one, which Bullet solves faster."""
         return pb.createMultiBody(mass, shape, skin, position, quaternion,
                                   useMaximalCoordinates=1, **self._world)
 
     def _build_arena(self):
         # A box, not GEOM_PLANE: Bullet finds one contact a step on a plane, and moving cubes sank.
         table = [2, 2, 0.5]
-        floor = self._body(0, table, self._skin([0.97, 0.97, 0.97, 1], table), [0, 0, -0.5])
+        white = self._skin([0.97, 0.97, 0.97, 1], table)
+        floor = self._body(0, self._box(table), white, [0, 0, -0.5])
         pb.changeDynamics(floor, -1, lateralFriction=FLOOR_FRICTION, **self._world)
 
         edge = (WALL + 0.02) * math.tan(math.pi / WALL_SIDES)
-        wall = [0.01, edge, 0.1]
-        shape = pb.createCollisionShape(pb.GEOM_BOX, halfExtents=wall, **self._world)
+        wall = self._box([0.01, edge, 0.1])
         rim = self._skin([0.6, 0.62, 0.66, 1], [0.01, edge, 0.006],
                          visualFramePosition=[0, 0, -0.094])
         for side in range(WALL_SIDES):
             angle = 2 * math.pi / WALL_SIDES * side
             middle = [(WALL + 0.01) * math.cos(angle), (WALL + 0.01) * math.sin(angle), 0.1]
             quaternion = pb.getQuaternionFromEuler([0, 0, angle])
-            self._body(0, wall, rim, middle, quaternion, shape)
+            self._body(0, wall, rim, middle, quaternion)
 
     def _build_robot(self):
         """Three bodies of three joints: Bullet solves them faster than one of nine."""
@@ -469,11 +472,11 @@ class TriFingerEnv(Env):
 
     def _build_cubes(self):
         half = [CUBE / 2] * 3
-        shape = pb.createCollisionShape(pb.GEOM_BOX, halfExtents=half, **self._world)
+        shape = self._box(half)
         skin = self._skin([1, 0, 0, 1], half)
         self._cubes = []
         for i in range(self.distractors + 1):
-            cube = self._body(self.cube_mass, half, skin, [0, 0, 1 + i], shape=shape)
+            cube = self._body(self.cube_mass, shape, skin, [0, 0, 1 + i])
             pb.changeDynamics(cube, -1, lateralFriction=CUBE_FRICTION, **self._world)
             self._cubes.append(cube)
         if self.render_mode:
@@ -617,8 +620,8 @@ class TriFingerEnv(Env):
             targets = [q + scale * a for q, a in zip(self._q, action)]
         else:                                                  # from [-1, 1] to the joint range
             targets = [low + (high - low) * (a + 1) / 2
-                       for a, low, high in zip(action, LOWER * 3, UPPER * 3)]
-        return clip(targets, LOWER * 3, UPPER * 3)
+                       for a, low, high in zip(action, JOINT_LOW * 3, JOINT_HIGH * 3)]
+        return clip(targets, JOINT_LOW * 3, JOINT_HIGH * 3)
 
     def _drive(self):
         """Let the physics run for one action with the joints drawn to their targets."""
@@ -631,8 +634,12 @@ class TriFingerEnv(Env):
             pb.stepSimulation(client)
 
     def _read(self):
-        """Read joints and cubes from the simulator. Returns why the episode must end, or None."""
-        client, reason = self._client, None
+        """Read joints (_q, _dq) and cubes (_poses, _cube_rows) from the simulator.
+
+        Returns why the episode must end, or None.
+        """
+        client = self._client                                  # faster than **self._world
+        reason = None
         states = [state for finger in self._fingers
                   for state in pb.getJointStates(finger, JOINTS, client)]
         self._q, self._dq, _, _ = zip(*states)
@@ -729,8 +736,9 @@ class TriFingerEnv(Env):
         """
         if self._steps is None or not self.render_mode:
             raise RuntimeError("render() needs render_mode='rgb_array' and a reset() first")
-        with_goal = self._shot(width, height)                  # TinyRenderer knows no transparency:
-        self._show_goal([0, 0, -1])                            # blend two pictures
+        # TinyRenderer knows no transparency: blend two pictures.
+        with_goal = self._shot(width, height)
+        self._show_goal([0, 0, -1])
         without_goal = self._shot(width, height)
         self._show_goal(*self.goal)
         return (0.5 * with_goal + 0.5 * without_goal).astype(np.uint8)
@@ -781,11 +789,12 @@ def check_positive(**numbers):
 def nine_numbers(action):
     """The action as nine floats in [-1, 1]; ValueError if it is not nine finite numbers."""
     try:
-        action = np.asarray(action, dtype=np.float64)
-    except (TypeError, ValueError):
-        action = np.array(np.nan)
-    numbers = action.tolist()
-    if action.shape != (9,) or not all(map(math.isfinite, numbers)):
+        array = np.asarray(action, dtype=np.float64)
+        numbers = array.tolist()
+        is_right = array.shape == (9,) and all(map(math.isfinite, numbers))
+    except (TypeError, ValueError):      # no numbers at all
+        is_right = False
+    if not is_right:
         raise ValueError(f"action must be nine finite numbers, shape (9,), got {action!r}")
     return clip(numbers, (-1.0,) * 9, (1.0,) * 9)
 

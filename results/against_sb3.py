@@ -37,6 +37,7 @@ class Encoder(BaseFeaturesExtractor):
     def __init__(self, space):
         super().__init__(space, DEFAULTS["z_dim"])
         self.agent = Agent("lrn", 2, DEFAULTS)
+        # SB3 makes heads of its own.
         del self.agent.policy, self.agent.value, self.agent.read_out, self.agent.log_std
 
     def forward(self, obs):

@@ -40,11 +40,10 @@ def main():
     args = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    numbers = {LRN: (12, 24, 48, 96, 192), RN: (12, 24, 48)}
-    for kind in (LRN, RN):
-        times = [milliseconds(kind(), K, args.repeats) for K in numbers[kind]]
-        slope, _ = np.polyfit(np.log(numbers[kind]), np.log(times), 1)
-        shown = ", ".join(f"K={K} {ms:.2f} ms" for K, ms in zip(numbers[kind], times))
+    for kind, numbers in {LRN: (12, 24, 48, 96, 192), RN: (12, 24, 48)}.items():
+        times = [milliseconds(kind(), K, args.repeats) for K in numbers]
+        slope, _ = np.polyfit(np.log(numbers), np.log(times), 1)
+        shown = ", ".join(f"K={K} {ms:.2f} ms" for K, ms in zip(numbers, times))
         print(f"{kind.__name__}: {shown}; slope {slope:.2f}", flush=True)
 
 

@@ -26,8 +26,8 @@ MEASURES = {                             # column of zeroshot.csv -> title of it
 # Student's t for a 95 % interval, by the number of seeds
 STUDENT = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776}
 TASKS = {"push": "PushingCube", "lift": "LiftingCube"}
-BLUE, RED, GREEN, YELLOW = FOUR = ("#0072B2", "#CC3311", "#009E73", "#AA8800")
-LINES = {                                # of figures 3, 4 and 6: encoder -> label, colour
+BLUE, RED, GREEN, YELLOW = "#0072B2", "#CC3311", "#009E73", "#AA8800"
+ENCODERS = {                             # of figures 3, 4 and 6 -> label, colour
     "lrn": ("LRN", BLUE),
     "rn": ("RN", GREEN),
     "attn": ("ATTN", RED),
@@ -80,7 +80,7 @@ WINDOW = 50                              # updates that a point of a training cu
 # ---- reading
 
 def fail(message):
-    """End with one line and status 2."""
+    """End with one line and status 2. (train.fail would import torch, which no figure needs.)"""
     print(f"figures.py: error: {message}", file=sys.stderr)
     sys.exit(2)
 
@@ -98,7 +98,7 @@ def read(run, name):
 
 def shipped_runs():
     """Run folders in this folder: task by task, encoder by encoder, group by group."""
-    return [run for task in TASKS for encoder in (*LINES, "mlp")
+    return [run for task in TASKS for encoder in (*ENCODERS, "mlp")
             for run in sorted(glob.glob(f"{HERE}/{task}-{encoder}-n[0-9]*-seed?"),
                               key=lambda path: (group_of(path), path))]
 
@@ -121,8 +121,8 @@ def by_seed(runs):
 class Cell(NamedTuple):
     """A measure at one N."""
     values: np.ndarray                   # each seed's mean over its episodes, (S,)
-    bar: float                           # half width of the 95 % interval over all episodes
-    half: float                          # of that over seeds; with one seed the same as `bar`
+    half: float                          # half width of the 95 % interval over seeds; with one
+                                         # seed of that over its episodes
 
 
 def bar_of(rows, i, measure):
@@ -136,14 +136,11 @@ def bar_of(rows, i, measure):
 
 
 def cell(values, bars):
-    """Cell of the seeds' means and of their intervals' half widths."""
-    values, bars = np.array(values), np.array(bars)
+    """Cell of the seeds' means, each with a half width `bars` over its episodes."""
+    values = np.array(values)
     S = len(values)
-    bar = np.sqrt(np.square(bars).sum()) / S
-    if S == 1:
-        return Cell(values, bar, bar)
-    half = STUDENT.get(S, 2.5) * values.std(ddof=1) / np.sqrt(S)
-    return Cell(values, bar, half)
+    half = bars[0] if S == 1 else STUDENT[S] * values.std(ddof=1) / np.sqrt(S)
+    return Cell(values, half)
 
 
 def over_seeds(runs, measure):
@@ -252,8 +249,10 @@ def pyplot():
 
 
 def smooth(rows, name, window=WINDOW):
-    """Frames in millions and the means of a column over `window` updates; a row may stand for
-    several updates (ship.py)."""
+    """Frames in millions, and means of a column over `window` updates.
+
+    A row may stand for several updates (ship.py).
+    """
     count = max(round(window * len(rows["update"]) / rows["update"][-1]), 1)
     means = np.convolve(rows[name], np.ones(count) / count, "valid")
     return rows["frames"][count - 1:] / 1e6, means
@@ -279,7 +278,7 @@ def with_seeds(label, runs):
 
 def draw_groups(axes, groups, lines):
     """Zero-shot curves of some groups of runs, {group: label}; one without runs is said so."""
-    for (group, label), color in zip(lines.items(), FOUR):
+    for (group, label), color in zip(lines.items(), (BLUE, RED, GREEN, YELLOW)):
         if group in groups:
             cells = over_seeds(groups[group], "success_aabb")
             draw_zero_shot(axes, cells, with_seeds(label, groups[group]), color)
@@ -305,6 +304,19 @@ def frames_to(runs, threshold):
     return np.array(found)
 
 
+def draw_frames_to(panel, groups, threshold, row, label, name, marker, color):
+    """A dot a run, at the N of its training; "never" stands in line `row` from the top."""
+    runs = [(N, run) for N in range(4) for run in groups.get(name.format(N), [])]
+    places = [N for N, _ in runs]
+    frames = frames_to([run for _, run in runs], threshold)
+    if not runs:
+        label += " (not run)"
+    panel.plot(places, frames, marker, color=color, alpha=0.7, label=label)
+    for N in {N for N, needed in zip(places, frames) if np.isnan(needed)}:
+        panel.annotate("never", (N, 1), (0, -14 * (row + 1)), color=color, ha="center",
+                       xycoords=("data", "axes fraction"), textcoords="offset points")
+
+
 def figure_1(folder):
     """Figure 1, right: frames until training success is 0.5 and 0.8, by the N of training.
 
@@ -319,18 +331,8 @@ def figure_1(folder):
              ("MLP, 3 M frames", "push-mlp-n{}", "o", YELLOW),
              ("LRN, 3 M frames", "push-lrn-n{}", "o", BLUE))
     for threshold, panel in zip((0.5, 0.8), axes):
-        for row, (label, name, marker, color) in enumerate(lines):
-            runs = {N: groups.get(name.format(N), []) for N in range(4)}
-            frames = {N: frames_to(runs[N], threshold) for N in runs}
-            places = [N for N in runs for _ in runs[N]]
-            if not places:
-                label += " (not run)"
-            panel.plot(places, np.concatenate(list(frames.values())), marker, color=color,
-                       alpha=0.7, label=label)
-            for N in runs:
-                if np.isnan(frames[N]).any():
-                    panel.annotate("never", (N, 1), (0, -14 * (row + 1)), color=color, ha="center",
-                                   xycoords=("data", "axes fraction"), textcoords="offset points")
+        for row, line in enumerate(lines):
+            draw_frames_to(panel, groups, threshold, row, *line)
         panel.set(title=f"PushingCube: frames to reach {threshold}", xlabel="N in training",
                   xticks=range(4), xlim=(-0.5, 3.5))
         panel.margins(y=0.4)                                   # room for "never"
@@ -345,7 +347,7 @@ def figure_3(folder):
     groups = by_seed(shipped_runs())
     figure, axes = plt.subplots(2, 2, figsize=(9, 8), layout="constrained")
     for task, (left, right) in zip(TASKS, axes):
-        for encoder, (label, color) in LINES.items():
+        for encoder, (label, color) in ENCODERS.items():
             runs = groups.get(f"{task}-{encoder}-n2")
             if not runs:
                 continue
@@ -370,7 +372,7 @@ def figure_4(folder):
     figure, axes = plt.subplots(1, 3, figsize=(11, 4), layout="constrained", sharey=True)
     for encoder, panel in zip(PAPER, axes):
         draw_groups(panel, groups, {f"push-{encoder}-n{N}": f"trained at {N}" for N in range(4)})
-        panel.set(title=LINES[encoder][0])
+        panel.set(title=ENCODERS[encoder][0])
     axes[0].set(ylabel="fractional success (axis-aligned)")
     save(figure, folder, "figure4.png")
 
@@ -395,7 +397,7 @@ def figure_6(folder):
     dots, drifts = read_text("figure6.csv"), read_text("figure6-drift.csv")
     figure, axes = plt.subplots(2, 2, figsize=(9, 8), layout="constrained")
     for encoder, panel in zip(PAPER, axes.flat):
-        label, color = LINES[encoder]
+        label, color = ENCODERS[encoder]
         of_it = [row for row in dots if row["encoder"] == encoder]
         places = np.array([[row["x"], row["y"]] for row in of_it], float).reshape(-1, 2)
         numbers = [int(row["distractors"]) for row in of_it]

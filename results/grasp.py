@@ -5,7 +5,7 @@
 
 In each try the cube lies near the centre; three fingertips close round it at a random height, press
 inwards by a random depth (inverse kinematics), and rise to 0.15 m. It counts as held if the cube
-is above 0.12 m for the last two seconds. The world as it is: 0.08 kg and 1.0.
+is above 0.12 m for the last two seconds. TriFingerEnv's defaults are 0.08 kg and 1.0.
 """
 import argparse
 import math
@@ -17,7 +17,7 @@ import pybullet as pb
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from train import positive
-from trifinger_env import (CUBE, FINGER_YAW, LOWER, UPPER, TriFingerEnv,
+from trifinger_env import (CUBE, FINGER_YAW, JOINT_LOW, JOINT_HIGH, TriFingerEnv,
                            inverse_kinematics, yaw_quaternion)
 
 BEARINGS = [yaw + math.pi for yaw in FINGER_YAW]               # every finger grasps on its own side
@@ -37,7 +37,7 @@ def tip_action(centre, radius, height, turn):
     """Action of mode "absolute" that brings the tips there."""
     angles = joint_angles(centre, radius, height, turn)
     return [2 * (q - low) / (high - low) - 1
-            for q, low, high in zip(angles, LOWER * 3, UPPER * 3)]
+            for q, low, high in zip(angles, JOINT_LOW * 3, JOINT_HIGH * 3)]
 
 
 def grasp(env, centre, yaw, depth, height, turn, lift=0.15):

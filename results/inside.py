@@ -24,53 +24,48 @@ HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path.insert(0, os.path.dirname(HERE))
 import evaluate
 from figures import KINDS, PAPER
-from train import fail, load, positive
-from trifinger_env import IDENTIFIER, TIME
+from train import Agent, fail, load, positive
+from trifinger_env import TIME
 
-LOOKS = 5                                # moments of an episode that t-SNE gets to see
+MOMENTS = 5                              # of an episode that t-SNE gets to see
 POINTS = 5000                            # most points that t-SNE and distances are given
+FIRST_DISTRACTOR = 4                     # index among relations_of(): after fingers and target
 
 
 # ---- playing
 
 @torch.inference_mode()
-def watch(run, distractors, episodes, look):
-    """look(agent, obs) -> (B, ...) after every step of `episodes` (a range): (steps, E, ...)."""
+def record(run, distractors, episodes, measure):
+    """measure(agent, obs) -> (B, ...) after every step of `episodes`: (steps, E, ...)."""
     checkpoint, agent = load(run)
-    seen = []
+    records = []
     for part in evaluate.chunks(episodes):
-        seeds = [evaluate.episode_seed(e) for e in part]
-        envs, observations, _ = evaluate.start(checkpoint, agent, distractors, seeds)
+        envs, observations = evaluate.start(checkpoint, distractors, part)
         steps = []
         for _ in range(checkpoint["settings"]["episode_steps"]):
             actions = evaluate.actions(agent, observations)
             played = [env.step(action) for env, action in zip(envs, actions)]
             refuse_if_cut_short(played)
             observations = [obs for obs, *_ in played]
-            steps.append(look(agent, evaluate.as_batch(observations)).numpy())
-        seen.append(np.stack(steps))
+            steps.append(measure(agent, evaluate.as_batch(observations)).numpy())
+        records.append(np.stack(steps))
         for env in envs:
             env.close()
-    return np.concatenate(seen, axis=1)
+    return np.concatenate(records, axis=1)
 
 
 def refuse_if_cut_short(played):
-    """ValueError if an episode ended before its time, as its z would be of another length."""
+    """ValueError if an episode ended before its time: it would have fewer steps than others."""
     for *_, truncated, info in played:
         if truncated and info["truncated_by"] != TIME:
             raise ValueError(f"an episode was cut short ({info['truncated_by']})")
-
-
-def z_of(agent, obs):
-    """z (B, Z)."""
-    return agent.encode(obs)
 
 
 def relations_of(agent, obs):
     """LRN's relations, fingers first, then the target, then distractors: (B, K, D)."""
     objects, goal = agent.tokens(obs)
     r = agent.encoder.relations(objects, goal)                 # (B, K, D), cubes first
-    is_target = obs["cubes"][..., IDENTIFIER] == obs["goal"][:, None, IDENTIFIER]
+    is_target = evaluate.is_target(obs)
     count = is_target.shape[1]
     fingers, target = r[:, count:], r[:, :count][is_target]
     others = r[:, :count][~is_target].view(len(r), count - 1, -1)
@@ -89,9 +84,9 @@ def energy_distance(a, b):
     return ((2 * torch.cdist(a, b).mean() - torch.cdist(a, a).mean() - within) / within).item()
 
 
-def some(points, count, seed=0):
+def some(points, count):
     """At most `count` rows, drawn without repetition."""
-    rows = np.random.default_rng(seed).permutation(len(points))[:count]
+    rows = np.random.default_rng(0).permutation(len(points))[:count]
     return points[rows]
 
 
@@ -105,8 +100,8 @@ def plane(points):
 
 
 def moments(steps):
-    """LOOKS moments, evenly over an episode: (steps, E, ...) -> (LOOKS * E, ...)."""
-    at = np.linspace(0, len(steps) - 1, LOOKS).astype(int)
+    """Moments evenly over an episode: (steps, E, ...) -> (MOMENTS * E, ...)."""
+    at = np.linspace(0, len(steps) - 1, MOMENTS).astype(int)
     return steps[at].reshape(-1, *steps.shape[2:])
 
 
@@ -121,12 +116,12 @@ def figure_6(episodes):
             print(f"figure 6 without {encoder}: {run} is not there")
             continue
         numbers = range(10)
-        steps = {N: watch(run, N, episodes, z_of) for N in numbers}
+        steps = {N: record(run, N, episodes, Agent.encode) for N in numbers}
         whole = {N: some(z.reshape(-1, z.shape[-1]), POINTS) for N, z in steps.items()}
         drifts += [(encoder, N, f"{energy_distance(whole[N], whole[2]):.4f}") for N in numbers]
-        looks = {N: some(moments(z), POINTS // 10) for N, z in steps.items()}
-        places = plane(np.concatenate(list(looks.values())))
-        labels = [N for N in numbers for _ in looks[N]]
+        sample = {N: some(moments(z), POINTS // len(numbers)) for N, z in steps.items()}
+        places = plane(np.concatenate(list(sample.values())))
+        labels = [N for N in numbers for _ in sample[N]]
         dots += [(encoder, N, f"{x:.2f}", f"{y:.2f}") for N, (x, y) in zip(labels, places)]
     write("figure6.csv", ("encoder", "distractors", "x", "y"), dots)
     write("figure6-drift.csv", ("encoder", "distractors", "distance"), drifts)
@@ -137,10 +132,10 @@ def figure_7(episodes):
     run = os.path.join(HERE, "push-lrn-n2-seed0")
     rows, kinds = [], []
     for N in range(3, 7):
-        r = moments(watch(run, N, episodes, relations_of))     # (n, K, D)
+        r = moments(record(run, N, episodes, relations_of))    # (n, K, D)
         r = some(r, POINTS // (4 * r.shape[1]))
         rows += list(r.reshape(-1, r.shape[-1]))
-        kinds += [list(KINDS)[min(i, 4)] for i in range(r.shape[1])] * len(r)
+        kinds += [*KINDS, *["distractors"] * (N - 1)] * len(r)             # KINDS has one of N
     places = plane(np.array(rows))
     write("figure7.csv", ("kind", "x", "y"),
           [(kind, f"{x:.2f}", f"{y:.2f}") for kind, (x, y) in zip(kinds, places)])
@@ -151,10 +146,10 @@ def figure_8(episodes):
     run = os.path.join(HERE, "push-lrn-n2-seed0")
     rows = []
     for N in (4, 5):
-        norms = np.linalg.norm(watch(run, N, episodes, relations_of), axis=-1)   # (steps, E, K)
-        means = norms.mean(axis=1)                                               # (steps, K)
-        for step, row in enumerate(means, 1):
-            values = [*row[:4], row[4:].mean()]
+        r = record(run, N, episodes, relations_of)             # (steps, E, K, D)
+        norms = np.linalg.norm(r, axis=-1).mean(axis=1)        # (steps, K)
+        for step, row in enumerate(norms, 1):
+            values = [*row[:FIRST_DISTRACTOR], row[FIRST_DISTRACTOR:].mean()]
             rows.append((N, step, *(f"{value:.3f}" for value in values)))
     write("figure8.csv", ("N", "step", *KINDS), rows)
 

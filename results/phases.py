@@ -55,13 +55,12 @@ class Watched:
 
 
 @torch.inference_mode()
-def watch(run, distractors, episodes):
+def play(run, distractors, episodes):
     """Heights of the goals (E,) and what the episodes came to (E, columns)."""
     checkpoint, agent = load(run)
     heights, rows = [], []
     for part in evaluate.chunks(range(episodes)):
-        seeds = [evaluate.episode_seed(e) for e in part]
-        envs, observations, _ = evaluate.start(checkpoint, agent, distractors, seeds)
+        envs, observations = evaluate.start(checkpoint, distractors, part)
         watched = [Watched(env) for env in envs]
         evaluate.to_the_end(agent, watched, observations)
         for env in watched:
@@ -82,7 +81,7 @@ def main():
     print("run | N | goal's height | episodes | " + " | ".join(COLUMNS))
     for run in args.runs:
         try:
-            heights, rows = watch(run, args.distractors, args.episodes)
+            heights, rows = play(run, args.distractors, args.episodes)
         except ValueError as error:
             fail(str(error))
         for label, at in bands(heights):

@@ -27,9 +27,9 @@ FIRST = 10_000                           # number of the first episode: far from
 def mean_distractor(run, distractors, episodes):
     """(D,) mean relation of a distractor over whole episodes."""
     which = range(FIRST, FIRST + episodes)
-    r = inside.watch(run, distractors, which, inside.relations_of)         # (steps, E, K, D)
-    others = r[:, :, 4:]                                       # without fingers and target
-    return torch.from_numpy(others.mean(axis=(0, 1, 2)))
+    r = inside.record(run, distractors, which, inside.relations_of)        # (steps, E, K, D)
+    of_distractors = r[:, :, inside.FIRST_DISTRACTOR:]
+    return torch.from_numpy(of_distractors.mean(axis=(0, 1, 2)))
 
 
 def recentre(weights, c, K):
@@ -42,14 +42,14 @@ def recentre(weights, c, K):
 def write_recentred(run, folder, episodes):
     """Write the recentred checkpoint of a run; returns c. ValueError for one that has no c."""
     checkpoint, agent = load(run)
-    T = agent.distractors
-    if agent.kind != "lrn" or not T or not agent.encoder.with_norm:
+    N = agent.distractors
+    if agent.kind != "lrn" or not N or not agent.encoder.with_norm:
         raise ValueError(f"{run}: needs an lrn agent trained with distractors, and with LayerNorm")
     path = os.path.join(folder, "checkpoint.pt")
     if os.path.exists(path):
         raise ValueError(f"{path} is there already: name another folder")
-    c = mean_distractor(run, T, episodes)
-    recentre(checkpoint["learner"], c, T + 4)
+    c = mean_distractor(run, N, episodes)
+    recentre(checkpoint["learner"], c, K=N + 4)                # N + 1 cubes, three fingers
     checkpoint.pop("optimizer", None)                          # its moments are of other weights
     os.makedirs(folder, exist_ok=True)
     save(checkpoint, path)

@@ -118,20 +118,20 @@ fail() {
 
 jobs=1
 list=
-patterns=()
+pattern=
 while [ $# -gt 0 ]; do
     case $1 in
-        --one) shift; one_run "$@"; exit ;;
+        --one) shift; one_run "$@"; exit ;;                    # what xargs calls, in the last line
         --jobs) jobs=${2-}; shift $(($# > 1 ? 2 : 1)) ;;
         --list) list=yes; shift ;;
         -*) fail "no option $1, only --list and --jobs" ;;
-        *) patterns+=("$1"); shift ;;
+        *) [ -z "$pattern" ] || fail "one pattern, got $pattern $1: \"a|b\" names both"
+           pattern=$1; shift ;;
     esac
 done
 [[ $jobs =~ ^[1-9][0-9]*$ ]] || fail "--jobs needs a number of runs"
-[ ${#patterns[@]} -le 1 ] || fail "one pattern, got ${patterns[*]}: \"a|b\" names both"
-rows=$(all_runs | awk -v pattern="${patterns[0]:-.}" '$1 ~ pattern')
-[ "$rows" ] || fail "no run's name matches ${patterns[0]}"
+rows=$(all_runs | awk -v pattern="${pattern:-.}" '$1 ~ pattern')
+[ "$rows" ] || fail "no run's name matches $pattern"
 if [ "$list" ]; then
     while read -r name arguments; do
         printf "%-30s %-24s %s\n" "$name" "$(state_of "$name")" "$arguments"

@@ -17,12 +17,12 @@ import torch
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import evaluate
 from train import fail, load, make_env, positive
-from trifinger_env import IDENTIFIER, IDENTIFIERS
+from trifinger_env import IDENTIFIERS
 
 
 def distractor_tokens(obs):
     """(B, N+5) bool over cubes, fingers and goal: which tokens are distractors?"""
-    is_distractor = obs["cubes"][..., IDENTIFIER] != obs["goal"][:, None, IDENTIFIER]
+    is_distractor = ~evaluate.is_target(obs)
     B = len(is_distractor)
     others = torch.zeros(B, 4, dtype=torch.bool)               # three fingers, the goal
     return torch.cat([is_distractor, others], dim=1)
@@ -65,24 +65,17 @@ def reweighed_z(agent, obs):
     return encoder.norm(encoder.f(total))
 
 
-def load_reweighed(run):
-    """As train.load(), with an agent that is told which cubes are distractors."""
-    checkpoint, agent = load(run)
-    agent.encode = lambda obs: reweighed_z(agent, obs)
-    return checkpoint, agent
-
-
-def play(run, N, episodes, loader):
-    """A row of zeroshot.csv of the agent that `loader` makes of the run."""
-    evaluate.load = loader               # evaluate.play() loads by itself: hand it our loader
-    evaluate.trained_z.cache_clear()     # z of the other agent
-    return evaluate.summary(N, evaluate.play(run, N, 0, episodes, sample_actions=False))
+def print_score(name, checkpoint, agent, N, episodes):
+    """Play the agent as it is now, and print a row."""
+    played = evaluate.play(checkpoint, agent, N, range(episodes), sample_actions=False)
+    row = evaluate.summary(N, played)
+    print(f"{name}: success {row['success_aabb']:.2f} +- {row['ci95']:.2f}, "
+          f"read error {1000 * row['read_error']:.1f} mm", flush=True)
 
 
 @torch.inference_mode()
-def print_lengths(run, N, episodes):
+def print_lengths(checkpoint, agent, N, episodes):
     """What each object adds to f's output of an LRN agent at the start of episodes."""
-    checkpoint, agent = load(run)
     env = make_env(checkpoint["task"], N, checkpoint["settings"])
     obs = evaluate.as_batch([env.reset(seed=evaluate.episode_seed(e))[0] for e in range(episodes)])
     env.close()
@@ -105,9 +98,10 @@ def main():
                         help="N (default 9; for a run trained at 9: 2)")
     parser.add_argument("--episodes", type=positive, default=100, metavar="E")
     args = parser.parse_args()
+    torch.set_num_threads(1)
     for run in args.runs:
         try:
-            _, agent = load(run)
+            checkpoint, agent = load(run)
         except ValueError as error:
             fail(str(error))
         if agent.kind not in ("lrn", "rn", "attn"):
@@ -117,12 +111,11 @@ def main():
         N = args.distractors
         if N is None:
             N = 2 if agent.distractors == 9 else 9
-        for name, loader in (("as it is", load), ("distractors reweighed", load_reweighed)):
-            row = play(run, N, args.episodes, loader)
-            print(f"{run} N={N} {name}: success {row['success_aabb']:.2f} +- {row['ci95']:.2f}, "
-                  f"read error {1000 * row['read_error']:.1f} mm", flush=True)
+        print_score(f"{run} N={N} as it is", checkpoint, agent, N, args.episodes)
+        agent.encode = lambda obs: reweighed_z(agent, obs)
+        print_score(f"{run} N={N} distractors reweighed", checkpoint, agent, N, args.episodes)
         if agent.kind == "lrn":
-            print_lengths(run, N, args.episodes)
+            print_lengths(checkpoint, agent, N, args.episodes)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import numpy as np
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from grasp import joint_angles
 from train import positive
-from trifinger_env import CUBE, LOWER, SOLVED, UPPER, TriFingerEnv
+from trifinger_env import CUBE, JOINT_LOW, SOLVED, JOINT_HIGH, TriFingerEnv
 
 AROUND, PRESSED = 0.08, CUBE / 2 - 0.02                        # tips' distance from the middle, m
 TURNS = [sign * turn for turn in np.arange(0.0, 0.9, 0.15) for sign in (1, -1)]
@@ -30,7 +30,7 @@ def possible_angles(centre, radius, turn):
         angles = joint_angles(centre[:2], radius, centre[2], turn)
     except ValueError:
         return None
-    is_within = all(low <= q <= high for q, low, high in zip(angles, LOWER * 3, UPPER * 3))
+    is_within = all(low <= q <= high for q, low, high in zip(angles, JOINT_LOW * 3, JOINT_HIGH * 3))
     return angles if is_within else None
 
 
