@@ -3199,6 +3199,8 @@ SCRIPTS = {                              # script: (arguments, words that it pri
     "scripted_lift.py": (["--episodes", "2"], ["0.00 to 0.20 m | 2 | 1.00"]),
     "phases.py": (["RUN", "--distractors", "1", "--episodes", "2"],
                   ["lrn | 1 | 0.00 to 0.20 m | 2"]),
+    "screen.py": (["--steps", "1", "--episodes", "1", "--out", os.devnull],
+                  ["| sum | 2 | 0 |", "| softmax | 9 | 1 |"]),
     "search.py": ([], ["| push-first | 2.0e-03 | 0.36 | 0.0"]),
     "recheck.py": (["results/push-lrn-n2-seed2", "--episodes", "2"],
                    ["push-lrn-n2-seed2 | N = 2 | 0.", "push-lrn-n2-seed2 | N = 9 | 0."]),
@@ -3312,6 +3314,24 @@ def test_table_puts_seeds_together(tmp_path, results_scripts):
     assert solved[3].endswith("| 0.50 ± 0.10 |")               # 1.96 * sqrt(0.5 * 0.5 / 100)
 
 
+def test_screened_encoders_pool_as_their_formulas_say(results_scripts):
+    import screen
+    objects, goal = torch.randn(2, 6, 64), torch.randn(2, 64)
+    gated, softmax = screen.LRNGated(), screen.LRNSoftmax()
+    for b in range(2):
+        total = torch.zeros(64)
+        for r in gated.relations(objects, goal)[b]:
+            total += r / (1 + math.exp(-float(r[0])))
+        torch.testing.assert_close(gated(objects, goal)[b], gated.norm(gated.f(total)))
+
+        asked = softmax.query.weight @ goal[b] + softmax.query.bias
+        relations = softmax.relations(objects, goal)[b]
+        weights = [6 ** (float(asked @ r) / 8) for r in relations]         # e^(log K x) = K^x
+        total = sum(w * r for w, r in zip(weights, relations)) / sum(weights)
+        torch.testing.assert_close(softmax(objects, goal)[b], softmax.norm(softmax.f(total)),
+                                   atol=1e-4, rtol=1e-4)
+
+
 def test_a_recheck_compares_with_the_file_in_other_episodes(tmp_path, results_scripts,
                                                             monkeypatch, capsys):
     """0.90 +- 0.03 and 0.94 +- 0.04 differ by 0.04, and that by +- 0.05."""
@@ -3384,6 +3404,9 @@ def test_tables_of_the_notebook_are_those_of_the_files():
         assert done.returncode == 0, done.stderr
         printed = [line for line in done.stdout.splitlines() if line.startswith("|")]
         assert len(printed) > 10 and set(printed) <= set(notebook), command
+    with open(os.path.join(HERE, "results", "screen.csv"), newline="") as file:   # takes too long
+        _, *rows = csv.reader(file)
+    assert len(rows) == 16 and {"| " + " | ".join(row) + " |" for row in rows} <= set(notebook)
 
 
 def test_shipped_curves_stand_for_windows_of_updates(results_scripts, monkeypatch):

@@ -62,6 +62,11 @@ all_runs() {
             a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
             a_run push lrn 2 $seed absolute --set action_mode=absolute
             a_run push lrn 2 $seed paper --paper                # the printed recipe, 60 M frames
+            a_run push lrn 2 $seed paper-values --paper --set normalize_values=True
+            a_run push lrn 2 $seed paper-normalized --paper --set normalize_values=True \
+                normalize_advantages=True
+            a_run push lrn 2 $seed paper-readout --paper --set normalize_values=True \
+                normalize_advantages=True auxiliary=30
             a_run push lrn 9 $seed
             a_run lift lrn 0 $seed
         fi
