@@ -121,30 +121,36 @@ fail() {
     exit 2
 }
 
-jobs=1
-list=
-pattern=
-while [ $# -gt 0 ]; do
-    case $1 in
-        --one) shift; one_run "$@"; exit ;;                    # what xargs calls, in the last line
-        --jobs) jobs=${2-}; shift $(($# > 1 ? 2 : 1)) ;;
-        --list) list=yes; shift ;;
-        -*) fail "no option $1, only --list and --jobs" ;;
-        *) [ -z "$pattern" ] || fail "one pattern, got $pattern $1: \"a|b\" names both"
-           pattern=$1; shift ;;
-    esac
-done
-[[ $jobs =~ ^[1-9][0-9]*$ ]] || fail "--jobs needs a number of runs"
-rows=$(all_runs | awk -v pattern="${pattern:-.}" '$1 ~ pattern')
-[ "$rows" ] || fail "no run's name matches $pattern"
-if [ "$list" ]; then
-    while read -r name arguments; do
-        printf "%-30s %-24s %s\n" "$name" "$(state_of "$name")" "$arguments"
-    done <<< "$rows"
-    exit
-fi
-while read -r name arguments; do
-    if [ "$(state_of "$name")" != "done" ]; then
-        echo "$name $arguments"
+# A function, so that bash has read it all before it runs: the file may be changed under way.
+main() {
+    jobs=1
+    list=
+    pattern=
+    while [ $# -gt 0 ]; do
+        case $1 in
+            --one) shift; one_run "$@"; exit ;;                # what xargs calls, in the last line
+            --jobs) jobs=${2-}; shift $(($# > 1 ? 2 : 1)) ;;
+            --list) list=yes; shift ;;
+            -*) fail "no option $1, only --list and --jobs" ;;
+            *) [ -z "$pattern" ] || fail "one pattern, got $pattern $1: \"a|b\" names both"
+               pattern=$1; shift ;;
+        esac
+    done
+    [[ $jobs =~ ^[1-9][0-9]*$ ]] || fail "--jobs needs a number of runs"
+    rows=$(all_runs | awk -v pattern="${pattern:-.}" '$1 ~ pattern')
+    [ "$rows" ] || fail "no run's name matches $pattern"
+    if [ "$list" ]; then
+        while read -r name arguments; do
+            printf "%-34s %-24s %s\n" "$name" "$(state_of "$name")" "$arguments"
+        done <<< "$rows"
+        exit
     fi
-done <<< "$rows" | xargs -r -P "$jobs" -L 1 results/reproduce.sh --one
+    while read -r name arguments; do
+        if [ "$(state_of "$name")" != "done" ]; then
+            echo "$name $arguments"
+        fi
+    done <<< "$rows" | xargs -r -P "$jobs" -L 1 results/reproduce.sh --one
+}
+
+main "$@"
+exit
