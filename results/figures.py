@@ -55,6 +55,7 @@ ABLATIONS = {                            # panels of figure 5: title -> {group o
         "push-lrn-n2": "without",
         "push-lrn-n2-curiosity": "with, weight 10",
         "push-lrn-n2-paperreward": "the paper's three terms",
+        "push-lrn-n2-sparse": "overlap and curiosity alone",
     },
 }
 SECTIONS = {                             # of the tables -> groups of runs; the first match counts
@@ -62,7 +63,7 @@ SECTIONS = {                             # of the tables -> groups of runs; the 
     "Figure 3": "-n2$",
     "Figure 4": "push-.*-n[013]$",
     "Figure 5": "-n2-(norelations|mean|z[0-9]+|no(overlap|distance|reach)|curiosity|"
-                "paperreward)$",
+                "sparse|paperreward)$",
     "What we added": "-(noreadout|rawvalues|rawadvantages|absolute|paper(-[a-z]+)?)$",
     "Beyond the paper": "",
 }

@@ -44,6 +44,8 @@ all_runs() {
             a_run push lrn 2 $seed nodistance --set reward_distance=0
             a_run push lrn 2 $seed noreach --set reward_reach=0
             a_run push lrn 2 $seed curiosity --set reward_curiosity=10
+            a_run push lrn 2 $seed sparse --set reward_distance=0 reward_reach=0 \
+                reward_curiosity=10
             a_run push lrn 2 $seed paperreward --set reward_distance=250 reward_reach=0 \
                 reward_curiosity=10
         fi
@@ -121,7 +123,8 @@ fail() {
     exit 2
 }
 
-# A function, so that bash has read it all before it runs: the file may be changed under way.
+# A function, so that bash has read all of it before it runs: editing this file does no harm then.
+# Each further run is started from the file as it stands at that moment.
 main() {
     jobs=1
     list=
@@ -129,7 +132,7 @@ main() {
     while [ $# -gt 0 ]; do
         case $1 in
             --one) shift; one_run "$@"; exit ;;                # what xargs calls, in the last line
-            --jobs) jobs=${2-}; shift $(($# > 1 ? 2 : 1)) ;;
+            --jobs) jobs=${2-}; shift; shift || true ;;
             --list) list=yes; shift ;;
             -*) fail "no option $1, only --list and --jobs" ;;
             *) [ -z "$pattern" ] || fail "one pattern, got $pattern $1: \"a|b\" names both"
@@ -152,5 +155,4 @@ main() {
     done <<< "$rows" | xargs -r -P "$jobs" -L 1 results/reproduce.sh --one
 }
 
-main "$@"
-exit
+main "$@"; exit

@@ -1,19 +1,20 @@
 """Which linear encoder tells the target cube from others at numbers that it has not seen?
 
-    python results/screen.py                    both training N, two seeds each: 20 minutes
-    python results/screen.py --steps 200        a glance
+    python results/screen.py                    both training N, two seeds each: half an hour
+    python results/screen.py --steps 200 --out glance.csv
 
 Supervised, so that many encoders cost little: an agent of train.py learns its read-out loss alone
-(Agent.auxiliary) on states of random play at N = 2 or 9, and the mean distance from the target cube
-to where it reads it is measured at other N, in states it was not trained on. It says which encoder
-can find a target in a crowd, not which one learns to act. Writes screen.csv.
+(Agent.auxiliary) on states of random play at N = 2 or 9. Then the mean distance from the target
+cube to where the agent reads it is measured at several N, in states that it was not trained on.
+That says which encoder learns quickly to find a target in a crowd, not which one learns to act.
 
 Each pools the relations r (B, K, D) of lrn.py in its own way:
     sum       sum_i r_i, the paper's
     max       the largest r_i in each dimension
     gated     sum_i sigmoid(r_i0) r_i, the first number of r_i being its own gate
-    softmax   sum_i w_i r_i, w = softmax(log K * W_q o_goal . r_i / sqrt(D)); log K keeps w from
-              growing flat in a crowd
+    softmax   sum_i w_i r_i, w = softmax(log K * q . r_i / sqrt(D)), q = W_q o_goal + b_q;
+              log K keeps w from growing flat in a crowd
+All K objects are real here, so the two new ones need not look at `present`.
 """
 import argparse
 import csv
@@ -33,23 +34,29 @@ HERE = os.path.dirname(os.path.abspath(__file__))
 TRAINED = (2, 9)                         # N
 NUMBERS = (0, 2, 5, 9, 14, 19)           # N of the measurement
 SEEDS = (0, 1)
-BATCH, LR = 500, 1e-3                    # as a minibatch of train.py
+BATCH = 500                              # as a minibatch of train.py
+LR = 1e-3
 OTHERS = 10_000                          # added to the seeds of states that nothing learns from
 COLUMNS = ("encoder", "trained", "seed", *NUMBERS)
 
 
 class LRNGated(LRN):
+    """Each relation opens or shuts its own gate."""
+
     def pool(self, r, present):
         """sum_i sigmoid(r_i0) r_i: (B, K, D) -> (B, D)."""
         return (r[..., :1].sigmoid() * r).sum(dim=1)
 
 
 class LRNSoftmax(LRN):
+    """The goal asks which relations matter; the encoder takes their weighted mean."""
+
     def __init__(self):
         super().__init__()
         self.query = orthogonal(nn.Linear(self.token_dim, self.token_dim), gain=1.0)
 
     def forward(self, objects, goal, present=None):
+        """objects (B, K, D), goal (B, D) -> z (B, Z)."""
         r = self.relations(objects, goal)                      # (B, K, D)
         _, K, D = r.shape
         scores = r @ self.query(goal)[:, :, None] / math.sqrt(D)           # (B, K, 1)
@@ -67,9 +74,9 @@ def states(distractors, episodes, first_seed):
     for seed in range(first_seed, first_seed + episodes):
         noise = torch.Generator().manual_seed(seed)
         observations.append(env.reset(seed=seed)[0])
-        truncated = False
+        truncated = False                # the only end that this world has
         while not truncated:
-            action = 0.5 * torch.randn(9, generator=noise)     # as deviates as training's at first
+            action = 0.5 * torch.randn(9, generator=noise)     # deviation of training at its start
             observation, _, _, truncated, _ = env.step(action.numpy())
             observations.append(observation)
     env.close()
@@ -107,7 +114,8 @@ def main():
     parser.add_argument("--steps", type=positive, default=3000, metavar="S", help="default 3000")
     parser.add_argument("--episodes", type=positive, default=200, metavar="E",
                         help="of random play to learn from; a fifth to measure (default 200)")
-    parser.add_argument("--out", default=os.path.join(HERE, "screen.csv"), metavar="FILE")
+    parser.add_argument("--out", default=os.path.join(HERE, "screen.csv"), metavar="FILE",
+                        help="default results/screen.csv")
     args = parser.parse_args()
     torch.set_num_threads(1)
     tests = {n: states(n, max(1, args.episodes // 5), OTHERS) for n in NUMBERS}
