@@ -3321,7 +3321,7 @@ def test_screened_encoders_pool_as_their_formulas_say(results_scripts):
     for b in range(2):
         total = torch.zeros(64)
         for r in gated.relations(objects, goal)[b]:
-            total += r / (1 + math.exp(-float(r[0])))
+            total += r / (1 + math.exp(-r[0].item()))
         torch.testing.assert_close(gated(objects, goal)[b], gated.norm(gated.f(total)))
 
         asked = softmax.query.weight @ goal[b] + softmax.query.bias
