@@ -3326,7 +3326,7 @@ def test_screened_encoders_pool_as_their_formulas_say(results_scripts):
 
         asked = softmax.query.weight @ goal[b] + softmax.query.bias
         relations = softmax.relations(objects, goal)[b]
-        weights = [6 ** (float(asked @ r) / 8) for r in relations]         # e^(log K x) = K^x
+        weights = [6 ** ((asked @ r).item() / 8) for r in relations]         # e^(log K x) = K^x
         total = sum(w * r for w, r in zip(weights, relations)) / sum(weights)
         torch.testing.assert_close(softmax(objects, goal)[b], softmax.norm(softmax.f(total)),
                                    atol=1e-4, rtol=1e-4)
