@@ -3317,7 +3317,7 @@ def test_table_puts_seeds_together(tmp_path, results_scripts):
 def test_screened_encoders_pool_as_their_formulas_say(results_scripts):
     import screen
     objects, goal = torch.randn(2, 6, 64), torch.randn(2, 64)
-    gated, softmax = screen.LRNGated(), screen.LRNSoftmax()
+    gated, softmax, alone = screen.LRNGated(), screen.LRNSoftmax(), screen.LRNAlone()
     for b in range(2):
         total = torch.zeros(64)
         for r in gated.relations(objects, goal)[b]:
@@ -3329,6 +3329,12 @@ def test_screened_encoders_pool_as_their_formulas_say(results_scripts):
         weights = [6 ** ((asked @ r).item() / 8) for r in relations]         # e^(log K x) = K^x
         total = sum(w * r for w, r in zip(weights, relations)) / sum(weights)
         torch.testing.assert_close(softmax(objects, goal)[b], softmax.norm(softmax.f(total)),
+                                   atol=1e-4, rtol=1e-4)
+
+        total = alone.g(alone.first(goal[b]))
+        for o in objects[b]:
+            total = total + alone.g(alone.first(o))
+        torch.testing.assert_close(alone(objects, goal)[b], alone.norm(alone.f(total)),
                                    atol=1e-4, rtol=1e-4)
 
 
@@ -3406,7 +3412,7 @@ def test_tables_of_the_notebook_are_those_of_the_files():
         assert len(printed) > 10 and set(printed) <= set(notebook), command
     with open(os.path.join(HERE, "results", "screen.csv"), newline="") as file:   # takes too long
         _, *rows = csv.reader(file)
-    assert len(rows) == 16 and {"| " + " | ".join(row) + " |" for row in rows} <= set(notebook)
+    assert len(rows) == 20 and {"| " + " | ".join(row) + " |" for row in rows} <= set(notebook)
 
 
 def test_shipped_curves_stand_for_windows_of_updates(results_scripts, monkeypatch):

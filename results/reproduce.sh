@@ -69,6 +69,8 @@ all_runs() {
                 normalize_advantages=True
             a_run push lrn 2 $seed paper-readout --paper --set normalize_values=True \
                 normalize_advantages=True auxiliary=30
+            a_run push lrn 2 $seed paper-batch --paper --set normalize_values=True \
+                normalize_advantages=True auxiliary=30 entropy=0.001 envs=8
             a_run push lrn 9 $seed
             a_run lift lrn 0 $seed
         fi

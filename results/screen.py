@@ -14,7 +14,9 @@ Each pools the relations r (B, K, D) of lrn.py in its own way:
     gated     sum_i sigmoid(r_i0) r_i, the first number of r_i being its own gate
     softmax   sum_i w_i r_i, w = softmax(log K * q . r_i / sqrt(D)), q = W_q o_goal + b_q;
               log K keeps w from growing flat in a crowd
-All K objects are real here, so the two new ones need not look at `present`.
+    alone     no relations: sum_i g(o_i) over the objects and the goal, figure 5's ablation with the
+              goal let in (as printed, z knows nothing of it)
+All K objects are real here, so the new ones need not look at `present`.
 """
 import argparse
 import csv
@@ -64,7 +66,19 @@ class LRNSoftmax(LRN):
         return self.norm(self.f((w * r).sum(dim=1)))           # (B, Z)
 
 
-ENCODERS = {"sum": LRN, "max": LRNMax, "gated": LRNGated, "softmax": LRNSoftmax}
+class LRNAlone(LRN):
+    """No relations: every object, and the goal as one more, is looked at alone."""
+
+    def __init__(self):
+        super().__init__(relations=False)
+
+    def forward(self, objects, goal, present=None):
+        """objects (B, K, D), goal (B, D) -> z (B, Z)."""
+        tokens = torch.cat([objects, goal[:, None]], dim=1)    # (B, K+1, D)
+        return super().forward(tokens, goal)
+
+
+ENCODERS = {"sum": LRN, "max": LRNMax, "gated": LRNGated, "softmax": LRNSoftmax, "alone": LRNAlone}
 
 
 def states(distractors, episodes, first_seed):
