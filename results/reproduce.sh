@@ -71,6 +71,11 @@ all_runs() {
                 normalize_advantages=True auxiliary=30
             a_run push lrn 2 $seed paper-batch --paper --set normalize_values=True \
                 normalize_advantages=True auxiliary=30 entropy=0.001 envs=8
+            a_run push lrn 2 $seed paper-short --paper --set normalize_values=True \
+                normalize_advantages=True auxiliary=30 entropy=0.001 envs=8 episode_steps=500
+            a_run push lrn 2 $seed paper-25hz --paper --set normalize_values=True \
+                normalize_advantages=True auxiliary=30 entropy=0.001 envs=8 episode_steps=125 \
+                substeps=5 timestep=0.008
             a_run push lrn 9 $seed
             a_run lift lrn 0 $seed
         fi
