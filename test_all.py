@@ -3199,6 +3199,7 @@ SCRIPTS = {                              # script: (arguments, words that it pri
     "scripted_lift.py": (["--episodes", "2"], ["0.00 to 0.20 m | 2 | 1.00"]),
     "phases.py": (["RUN", "--distractors", "1", "--episodes", "2"],
                   ["lrn | 1 | 0.00 to 0.20 m | 2"]),
+    "thrown.py": (["RUN", "--distractors", "1", "--episodes", "2"], ["far out", "| lrn | 0."]),
     "screen.py": (["--steps", "1", "--episodes", "1", "--out", os.devnull],
                   ["| sum | 2 | 0 |", "| softmax | 9 | 1 |"]),
     "search.py": ([], ["| push-first | 2.0e-03 | 0.36 | 0.0"]),
@@ -3338,6 +3339,28 @@ def test_screened_encoders_pool_as_their_formulas_say(results_scripts):
                                    atol=1e-4, rtol=1e-4)
 
 
+def test_a_thrown_cube_is_told_from_a_pushed_one(results_scripts):
+    """Four steps of 40 ms, two of them fast, two that end far out (0.13 m), by hand."""
+    import thrown
+
+    class Moving:
+        substeps, timestep = 5, 0.008
+        places = iter([(0.07, 0, 0.03), (0.07, 0.06, 0.03), (0.07, 0.06, 0.04), (0.0, 0.13, 0.03),
+                       (0.0, 0.13, 0.03)])
+        _moment = SimpleNamespace(position=next(places))
+
+        def step(self, action):
+            self._moment = SimpleNamespace(position=next(self.places))
+            return None, 0.0, False, False, {"fractional_success": 0.5}
+
+    watched = thrown.Watched(Moving())
+    for _ in range(4):
+        watched.step(None)
+    way = math.sqrt(0.07 ** 2 + 0.07 ** 2 + 0.01 ** 2)
+    speed = (0.06 + 0.01 + way) / (4 * 0.04)
+    np.testing.assert_allclose(watched.row(), (speed, 2 / 4, 2 / 4, 0.5))
+
+
 def test_a_recheck_compares_with_the_file_in_other_episodes(tmp_path, results_scripts,
                                                             monkeypatch, capsys):
     """0.90 +- 0.03 and 0.94 +- 0.04 differ by 0.04, and that by +- 0.05."""
@@ -3376,10 +3399,18 @@ def test_frames_to_a_threshold_are_those_of_a_mean_over_25_updates(tmp_path, res
 def test_every_table_stands_in_the_section_of_its_figure(results_scripts):
     import figures
 
-    places = {"push-mlp-n2": "Figure 1", "lift-attn-n2": "Figure 3", "push-lrn-max-n2": "Figure 3",
-              "push-rn-n3": "Figure 4", "push-lrn-n2-z100": "Figure 5", "lift-lrn-n0":
-              "Beyond the paper", "push-rn-n2-noreadout": "What we added",
-              "push-lrn-max-n9": "Beyond the paper"}
+    places = {
+        "push-mlp-n2": "Figure 1",
+        "lift-attn-n2": "Figure 3",
+        "push-lrn-max-n2": "Figure 3",
+        "push-rn-n3": "Figure 4",
+        "push-lrn-n2-z100": "Figure 5",
+        "push-rn-n2-noreadout": "What we added",
+        "push-lrn-n2-paperworld": "What we added",
+        "push-lrn-n2-paper-25hz": "What we added",
+        "lift-lrn-n0": "Beyond the paper",
+        "push-lrn-max-n9": "Beyond the paper",
+    }
     for group, title in places.items():
         assert figures.section_of(f"results/{group}-seed0") == title, group
     of_figure_5 = {group for lines in figures.ABLATIONS.values() for group in lines}

@@ -63,6 +63,11 @@ all_runs() {
             a_run push lrn 2 $seed rawvalues --set normalize_values=False
             a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
             a_run push lrn 2 $seed absolute --set action_mode=absolute
+            a_run push lrn 2 $seed paperworld --set action_mode=absolute cube_mass=0.02 \
+                finger_friction=0.1 goal_yaw=0.7854 \
+                reward_distance=250 reward_reach=0 reward_curiosity=10
+            a_run push lrn 2 $seed slippery --set cube_mass=0.02 finger_friction=0.1 \
+                reward_distance=250 reward_reach=0 reward_curiosity=10
             a_run push lrn 2 $seed paper --paper                # the printed recipe, 60 M frames
             a_run push lrn 2 $seed paper-values --paper --set normalize_values=True
             a_run push lrn 2 $seed paper-normalized --paper --set normalize_values=True \
