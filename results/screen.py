@@ -1,6 +1,6 @@
 """Which linear encoder tells the target cube from others at numbers that it has not seen?
 
-    python results/screen.py                    both training N, two seeds each: half an hour
+    python results/screen.py                    both training N, two seeds each: 45 minutes
     python results/screen.py --steps 200 --out glance.csv
 
 Supervised, so that many encoders cost little: an agent of train.py learns its read-out loss alone
