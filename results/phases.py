@@ -55,35 +55,43 @@ class Watched:
 
 
 @torch.inference_mode()
-def play(run, distractors, episodes):
-    """Heights of the goals (E,) and what the episodes came to (E, columns)."""
-    checkpoint, agent = load(run)
-    heights, rows = [], []
-    for part in evaluate.chunks(range(episodes)):
-        envs, observations = evaluate.start(checkpoint, distractors, part)
-        watched = [Watched(env) for env in envs]
-        evaluate.to_the_end(agent, watched, observations)
-        for env in watched:
-            heights.append(env.height)
-            rows.append([env.row[name] for name in COLUMNS])
-            env.env.close()
-    return np.array(heights), np.array(rows, float)
+def play(run, args, watch, sample_actions=False):
+    """The episodes of `args`, each played to its end in a watch(env): a list of these."""
+    try:
+        checkpoint, agent = load(run)
+        played = []
+        for part in evaluate.chunks(range(args.episodes)):
+            envs, observations = evaluate.start(checkpoint, args.distractors, part)
+            watched = [watch(env) for env in envs]
+            generators = evaluate.noise_of(part) if sample_actions else None
+            evaluate.to_the_end(agent, watched, observations, generators)
+            for env in envs:
+                env.close()
+            played += watched
+    except ValueError as error:
+        fail(str(error))
+    return played
+
+
+def read_command(description, episodes):
+    """The command's arguments: runs, N and by default so many episodes."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.error = fail
+    add = parser.add_argument
+    add("runs", nargs="+", metavar="RUN")
+    add("--distractors", type=int, default=2, metavar="N", help="default 2")
+    add("--episodes", type=positive, default=episodes, metavar="E", help=f"default {episodes}")
+    return parser.parse_args()
 
 
 def main():
-    parser = argparse.ArgumentParser(description="Phases of lifting by height of the goal.")
-    parser.error = fail
-    parser.add_argument("runs", nargs="+", metavar="RUN")
-    parser.add_argument("--distractors", type=int, default=2, metavar="N", help="default 2")
-    parser.add_argument("--episodes", type=positive, default=200, metavar="E", help="default 200")
-    args = parser.parse_args()
+    args = read_command("Phases of lifting by height of the goal.", episodes=200)
     torch.set_num_threads(1)
     print("run | N | goal's height | episodes | " + " | ".join(COLUMNS))
     for run in args.runs:
-        try:
-            heights, rows = play(run, args.distractors, args.episodes)
-        except ValueError as error:
-            fail(str(error))
+        played = play(run, args, Watched)
+        heights = np.array([env.height for env in played])
+        rows = np.array([[env.row[name] for name in COLUMNS] for env in played], float)
         for label, at in bands(heights):
             means = " | ".join(f"{mean:.2f}" for mean in rows[at].mean(axis=0))
             print(f"{os.path.basename(os.path.normpath(run))} | {args.distractors} | {label} | "

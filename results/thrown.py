@@ -8,7 +8,6 @@ training: the target cube's speed; the share of steps in which it is faster than
 which its centre lies further out than GRASP_RADIUS, where a finger can no longer get behind it
 from every side; and the score at the end (axis-aligned).
 """
-import argparse
 import math
 import os
 import sys
@@ -17,8 +16,7 @@ import numpy as np
 import torch
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-import evaluate
-from train import fail, load, positive
+from phases import play, read_command
 from trifinger_env import GRASP_RADIUS
 
 FAST = 0.3                               # m/s
@@ -48,36 +46,13 @@ class Watched:
         return speed.mean(), (speed > FAST).mean(), (radius > GRASP_RADIUS).mean(), self.success
 
 
-@torch.inference_mode()
-def play(run, distractors, episodes):
-    """Rows of the episodes (E, columns)."""
-    checkpoint, agent = load(run)
-    rows = []
-    for part in evaluate.chunks(range(episodes)):
-        envs, observations = evaluate.start(checkpoint, distractors, part)
-        watched = [Watched(env) for env in envs]
-        evaluate.to_the_end(agent, watched, observations, evaluate.noise_of(part))
-        rows += [env.row() for env in watched]
-        for env in envs:
-            env.close()
-    return np.array(rows)
-
-
 def main():
-    parser = argparse.ArgumentParser(description="Is the target cube pushed or thrown about?")
-    parser.error = fail
-    parser.add_argument("runs", nargs="+", metavar="RUN")
-    parser.add_argument("--distractors", type=int, default=2, metavar="N", help="default 2")
-    parser.add_argument("--episodes", type=positive, default=50, metavar="E", help="default 50")
-    args = parser.parse_args()
+    args = read_command("Is the target cube pushed or thrown about?", episodes=50)
     torch.set_num_threads(1)
     print("| sampled actions | " + " | ".join(COLUMNS) + " |")
     print("|---" * (1 + len(COLUMNS)) + "|")
     for run in args.runs:
-        try:
-            rows = play(run, args.distractors, args.episodes)
-        except ValueError as error:
-            fail(str(error))
+        rows = np.array([env.row() for env in play(run, args, Watched, sample_actions=True)])
         means = " | ".join(f"{mean:.2f}" for mean in rows.mean(axis=0))
         print(f"| {os.path.basename(os.path.normpath(run))} | {means} |", flush=True)
 
