@@ -3406,8 +3406,9 @@ def test_every_table_stands_in_the_section_of_its_figure(results_scripts):
         "push-rn-n3": "Figure 4",
         "push-lrn-n2-z100": "Figure 5",
         "push-rn-n2-noreadout": "What we added",
-        "push-lrn-n2-paperworld": "What we added",
         "push-lrn-n2-paper-25hz": "What we added",
+        "push-lrn-n2-paperworld-ppo": "What we added",
+        "push-attn-n2-noreadout-long": "What we added",
         "lift-lrn-n0": "Beyond the paper",
         "push-lrn-max-n9": "Beyond the paper",
     }

@@ -64,8 +64,8 @@ SECTIONS = {                             # of the tables -> groups of runs; the 
     "Figure 4": "push-.*-n[013]$",
     "Figure 5": "-n2-(norelations|mean|z[0-9]+|no(overlap|distance|reach)|curiosity|"
                 "sparse|paperreward)$",
-    "What we added": "-(noreadout|rawvalues|rawadvantages|absolute|paperworld|slippery|"
-                     "paper(-[a-z0-9]+)?)$",
+    "What we added": "-(noreadout|rawvalues|rawadvantages|absolute|slippery|"
+                     "paper|paperworld)(-[a-z0-9]+)?$",
     "Beyond the paper": "",
 }
 KINDS = {                                # of relations -> colour, those of the paper's figure 7

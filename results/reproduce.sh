@@ -59,6 +59,7 @@ all_runs() {
         if [ $seed = 0 ]; then
             for encoder in lrn rn attn; do                     # without our read-out loss
                 a_run push $encoder 2 $seed noreadout --set auxiliary=0
+                a_run push $encoder 2 $seed noreadout-long --frames 20000000 --set auxiliary=0
             done
             a_run push lrn 2 $seed rawvalues --set normalize_values=False
             a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
@@ -66,6 +67,15 @@ all_runs() {
             a_run push lrn 2 $seed paperworld --set action_mode=absolute cube_mass=0.02 \
                 finger_friction=0.1 goal_yaw=0.7854 \
                 reward_distance=250 reward_reach=0 reward_curiosity=10
+            a_run push lrn 2 $seed paperworld-ppo --set action_mode=absolute cube_mass=0.02 \
+                finger_friction=0.1 goal_yaw=0.7854 \
+                reward_distance=250 reward_reach=0 reward_curiosity=10 \
+                lr=2.5e-4 clip=0.5 anneal_clip=True epochs=4 minibatches=40 adam_eps=1e-8 \
+                log_std=0
+            a_run push lrn 2 $seed paperworld-30s --set action_mode=absolute cube_mass=0.02 \
+                finger_friction=0.1 goal_yaw=0.7854 \
+                reward_distance=250 reward_reach=0 reward_curiosity=10 \
+                substeps=3 timestep=0.004 episode_steps=2500 steps=2500 envs=2
             a_run push lrn 2 $seed slippery --set cube_mass=0.02 finger_friction=0.1 \
                 reward_distance=250 reward_reach=0 reward_curiosity=10
             a_run push lrn 2 $seed paper --paper                # the printed recipe, 60 M frames
