@@ -72,6 +72,9 @@ all_runs() {
                 reward_distance=250 reward_reach=0 reward_curiosity=10 \
                 lr=2.5e-4 clip=0.5 anneal_clip=True epochs=4 minibatches=40 adam_eps=1e-8 \
                 log_std=0
+            a_run push lrn 2 $seed paperworld-std --set action_mode=absolute cube_mass=0.02 \
+                finger_friction=0.1 goal_yaw=0.7854 \
+                reward_distance=250 reward_reach=0 reward_curiosity=10 log_std=0
             a_run push lrn 2 $seed paperworld-30s --set action_mode=absolute cube_mass=0.02 \
                 finger_friction=0.1 goal_yaw=0.7854 \
                 reward_distance=250 reward_reach=0 reward_curiosity=10 \
