@@ -61,6 +61,7 @@ all_runs() {
                 a_run push $encoder 2 $seed noreadout --set auxiliary=0
                 a_run push $encoder 2 $seed noreadout-long --frames 20000000 --set auxiliary=0
             done
+            a_run push lrn 0 $seed noreadout --set auxiliary=0
             a_run push lrn 2 $seed rawvalues --set normalize_values=False
             a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
             a_run push lrn 2 $seed absolute --set action_mode=absolute
