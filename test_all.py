@@ -3200,6 +3200,7 @@ SCRIPTS = {                              # script: (arguments, words that it pri
     "phases.py": (["RUN", "--distractors", "1", "--episodes", "2"],
                   ["lrn | 1 | 0.00 to 0.20 m | 2"]),
     "thrown.py": (["RUN", "--distractors", "1", "--episodes", "2"], ["far out", "| lrn | 0."]),
+    "probe.py": (["RUN", "--distractors", "1"], ["named cube (mm)", "| lrn | 1 | "]),
     "screen.py": (["--steps", "1", "--episodes", "1", "--out", os.devnull],
                   ["| sum | 2 | 0 |", "| softmax | 9 | 1 |"]),
     "search.py": ([], ["| push-first | 2.0e-03 | 0.36 | 0.0"]),
@@ -3359,6 +3360,37 @@ def test_a_thrown_cube_is_told_from_a_pushed_one(results_scripts):
     way = math.sqrt(0.07 ** 2 + 0.07 ** 2 + 0.01 ** 2)
     speed = (0.06 + 0.01 + way) / (4 * 0.04)
     np.testing.assert_allclose(watched.row(), (speed, 2 / 4, 2 / 4, 0.5))
+
+
+def test_a_probe_reads_what_z_holds_and_nothing_else(results_scripts):
+    """z holds the first place, turned and stretched, and nothing of the second one."""
+    import probe
+
+    torch.manual_seed(0)
+    held, independent = torch.randn(2, 3000, 2)
+    z = torch.cat([held @ torch.tensor([[3.0, 1.0], [-1.0, 2.0]]), torch.ones(3000, 1)], dim=1)
+    guess = probe.guess_error(independent)
+    assert abs(guess - math.sqrt(math.pi / 2)) < 0.1           # mean length of a 2-D normal
+    assert probe.reading_error(z, held) < 0.1 * guess
+    assert 0.9 * guess < probe.reading_error(z, independent) < 1.3 * guess
+
+
+def test_a_probe_names_each_cube_as_often_and_another_one_beside_it(results_scripts):
+    import probe
+
+    torch.manual_seed(0)
+    env = train.make_env("push", 2, train.DEFAULTS)
+    states = evaluate.as_batch([env.reset(seed=seed)[0] for seed in range(30)] * 20)
+    env.close()
+    before = states["goal"].clone()
+    obs, named, other = probe.named_at_random(states)
+    ids = states["cubes"][:, :, -1]
+    for b in range(len(named)):
+        assert obs["goal"][b, -1] == ids[b, named[b]] != ids[b, other[b]]
+    assert torch.equal(obs["goal"][:, :-1], before[:, :-1])
+    assert torch.equal(states["goal"], before)                 # the states stay as they were
+    counts = torch.bincount(named, minlength=3)
+    assert len(counts) == 3 and (counts - 200).abs().max() < 60
 
 
 def test_a_recheck_compares_with_the_file_in_other_episodes(tmp_path, results_scripts,

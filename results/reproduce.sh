@@ -62,6 +62,9 @@ all_runs() {
                 a_run push $encoder 2 $seed noreadout-long --frames 20000000 --set auxiliary=0
             done
             a_run push lrn 0 $seed noreadout --set auxiliary=0
+            a_run push lrn 2 $seed noreadout-paperreward --set auxiliary=0 \
+                reward_distance=250 reward_reach=0 reward_curiosity=10
+            a_run push lrn 2 $seed noreadout-curiosity --set auxiliary=0 reward_curiosity=10
             a_run push lrn 2 $seed rawvalues --set normalize_values=False
             a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
             a_run push lrn 2 $seed absolute --set action_mode=absolute
