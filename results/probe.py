@@ -1,13 +1,17 @@
 """Does z tell where the cube is that the goal names?
 
-    python results/probe.py results/push-lrn-n2-seed0 [RUN ...]           N = 2; 15 s a run
+    python results/probe.py results/push-lrn-n2-seed0 [RUN ...]           N = 2; 20 s a run
     python results/probe.py RUN --distractors 5
 
 The agent stays as it is. A small network is trained by supervised learning to read the named
-cube's place (x, y) from z, and a second one to read that of another cube. Both are asked in states
-they have not seen, the starts of 1000 episodes; they are trained on 5000 more. In all of them the
-goal names any of the cubes, so that the law of places is the same for both. Prints mean distances
-in mm: an agent that knows which cube is meant has a small one for the named cube alone.
+cube's place (x, y) from z, and a second one to read that of another cube. Both are trained on the
+starts of 5000 episodes and asked in 1000 others. All have two or more cubes in the middle of the
+arena, where targets are drawn; one of these is named at random, another one is the other cube. So
+nothing but the name tells them apart, and a z that does not use it serves both equally.
+
+Prints mean distances in mm, also that of the read-out that was trained with the agent, if there
+was one, in the same states. (Only "as large as for the named cube" means something for the other
+cube: which of the rest is meant cannot be seen in a z that does not know the order of cubes.)
 """
 import argparse
 import os
@@ -18,27 +22,38 @@ import torch
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import evaluate
 from train import fail, load, make_env, mlp
-from trifinger_env import IDENTIFIER, POSITION, POSITION_SCALE
+from trifinger_env import GRASP_RADIUS, IDENTIFIER, POSITION, POSITION_SCALE
 
 TRAINED, ASKED = 5000, 1000              # states
 STEPS, BATCH = 1500, 256                 # of Adam
 
 
-def named_at_random(obs):
-    """Observations whose goals name a random cube; the rows of that cube and of the next: (B,)."""
-    cubes, goal = obs["cubes"], obs["goal"].clone()
-    B, count = cubes.shape[:2]
-    named = torch.randint(count, (B,))
-    goal[:, IDENTIFIER] = cubes[torch.arange(B), named, IDENTIFIER]
-    return {**obs, "goal": goal}, named, (named + 1) % count
+def in_the_middle(obs):
+    """(..., N+1) bool: which cubes lie where targets are drawn?"""
+    places = obs["cubes"][..., POSITION][..., :2] * POSITION_SCALE         # m
+    return (places ** 2).sum(-1) < GRASP_RADIUS ** 2
 
 
 def start_states(checkpoint, distractors, count):
-    """The first observations of `count` episodes, as a batch."""
+    """First observations of `count` episodes with two cubes or more in the middle, as a batch."""
     env = make_env(checkpoint["task"], distractors, checkpoint["settings"])
-    observations = [env.reset(seed=0 if i == 0 else None)[0] for i in range(count)]
+    obs, _ = env.reset(seed=0)
+    observations = []
+    while len(observations) < count:
+        if in_the_middle(obs).sum() > 1:
+            observations.append(obs)
+        obs, _ = env.reset()
     env.close()
     return evaluate.as_batch(observations)
+
+
+def named_at_random(obs):
+    """Observations whose goals name a random cube of the middle; its row and another's: (B,)."""
+    cubes, goal = obs["cubes"], obs["goal"].clone()
+    two = torch.multinomial(in_the_middle(obs).float(), 2)     # (B, 2) without repetition
+    named, other = two.T
+    goal[:, IDENTIFIER] = cubes[torch.arange(len(cubes)), named, IDENTIFIER]
+    return {**obs, "goal": goal}, named, other
 
 
 def reading_error(z, places):
@@ -66,17 +81,26 @@ def guess_error(places):
     return (places[-ASKED:] - places[:-ASKED].mean(dim=0)).norm(dim=1).mean().item()
 
 
+@torch.no_grad()
+def own_error(agent, z, places):
+    """The same of the agent's read-out, in the asked rows."""
+    read = agent.read_out(z[-ASKED:])[:, :2]
+    return (read - places[-ASKED:]).norm(dim=1).mean().item()
+
+
 def probe(run, distractors):
-    """Reading errors for the named cube and for another one, and that of a guess, in mm."""
-    torch.manual_seed(0)
+    """Errors in mm: for the named cube, for another one, of a guess, and of the own read-out."""
     checkpoint, agent = load(run)
+    torch.manual_seed(0)                                       # after load(), which draws weights
     obs, named, other = named_at_random(start_states(checkpoint, distractors, TRAINED + ASKED))
     with torch.no_grad():
         z = agent.encode(obs)
     places = obs["cubes"][..., POSITION][..., :2]              # (B, N+1, 2), about [-1, 1]
     rows = torch.arange(len(z))
-    errors = (reading_error(z, places[rows, named]), reading_error(z, places[rows, other]),
-              guess_error(places[rows, named]))
+    at_named, at_other = places[rows, named], places[rows, other]
+    errors = [reading_error(z, at_named), reading_error(z, at_other), guess_error(at_named)]
+    if checkpoint["settings"]["auxiliary"] > 0:                # trained with a read-out
+        errors.append(own_error(agent, z, at_named))
     return [1000 * POSITION_SCALE * error for error in errors]
 
 
@@ -89,15 +113,15 @@ def main():
     if args.distractors < 1:
         fail("without a distractor there is no other cube to name")
     torch.set_num_threads(1)
-    print("| run | N | named cube (mm) | another cube | a guess |")
-    print("|---|---|---|---|---|")
+    print("| run | N | named cube (mm) | another cube | a guess | own read-out |")
+    print("|---|---|---|---|---|---|")
     for run in args.runs:
         try:
             errors = probe(run, args.distractors)
         except ValueError as error:
             fail(str(error))
         name = os.path.basename(os.path.normpath(run))
-        cells = " | ".join(f"{error:.0f}" for error in errors)
+        cells = " | ".join([*(f"{error:.0f}" for error in errors), "-"][:4])
         print(f"| {name} | {args.distractors} | {cells} |", flush=True)
 
 
