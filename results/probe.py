@@ -6,14 +6,15 @@
 The agent stays as it is. A small network is trained by supervised learning to read the named
 cube's place (x, y) from z, and a second one to read that of another cube. Both are trained on the
 starts of 5000 episodes and asked in 1000 others. All have two or more cubes in the middle of the
-arena, where targets are drawn; one of these is named at random, another one is the other cube. So
-nothing but the name tells them apart, and a z that does not use it serves both equally.
+arena, where targets are drawn: one of these is named at random, another is the other cube. So
+nothing but the name tells the two apart, and a z that does not use it serves both equally.
 
 Prints mean distances in mm, also that of the read-out that was trained with the agent, if there
 was one, in the same states. (Only "as large as for the named cube" means something for the other
 cube: which of the rest is meant cannot be seen in a z that does not know the order of cubes.)
 """
 import argparse
+import math
 import os
 import sys
 
@@ -73,19 +74,23 @@ def reading_error(z, places):
         loss.backward()
         optimizer.step()
     with torch.no_grad():
-        return (network(z[asked]) - places[asked]).norm(dim=1).mean().item()
+        return mean_distance(network(z[asked]), places)
+
+
+def mean_distance(read, places):
+    """Mean distance of what is read for the asked rows, (ASKED, 2) or one place, from the truth."""
+    return (read - places[-ASKED:]).norm(dim=1).mean().item()
 
 
 def guess_error(places):
     """What the best constant guess errs by, roughly: the mean of the known places."""
-    return (places[-ASKED:] - places[:-ASKED].mean(dim=0)).norm(dim=1).mean().item()
+    return mean_distance(places[:-ASKED].mean(dim=0), places)
 
 
 @torch.no_grad()
 def own_error(agent, z, places):
-    """The same of the agent's read-out, in the asked rows."""
-    read = agent.read_out(z[-ASKED:])[:, :2]
-    return (read - places[-ASKED:]).norm(dim=1).mean().item()
+    """What the read-out that was trained with the agent errs by."""
+    return mean_distance(agent.read_out(z[-ASKED:])[:, :2], places)
 
 
 def probe(run, distractors):
@@ -98,9 +103,10 @@ def probe(run, distractors):
     places = obs["cubes"][..., POSITION][..., :2]              # (B, N+1, 2), about [-1, 1]
     rows = torch.arange(len(z))
     at_named, at_other = places[rows, named], places[rows, other]
-    errors = [reading_error(z, at_named), reading_error(z, at_other), guess_error(at_named)]
+    own = float("nan")
     if checkpoint["settings"]["auxiliary"] > 0:                # trained with a read-out
-        errors.append(own_error(agent, z, at_named))
+        own = own_error(agent, z, at_named)
+    errors = reading_error(z, at_named), reading_error(z, at_other), guess_error(at_named), own
     return [1000 * POSITION_SCALE * error for error in errors]
 
 
@@ -121,7 +127,7 @@ def main():
         except ValueError as error:
             fail(str(error))
         name = os.path.basename(os.path.normpath(run))
-        cells = " | ".join([*(f"{error:.0f}" for error in errors), "-"][:4])
+        cells = " | ".join("-" if math.isnan(error) else f"{error:.0f}" for error in errors)
         print(f"| {name} | {args.distractors} | {cells} |", flush=True)
 
 

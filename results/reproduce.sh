@@ -19,6 +19,8 @@ a_run() {
 
 # The runs of all figures, those of the first seed first.
 all_runs() {
+    paper_reward="reward_distance=250 reward_reach=0 reward_curiosity=10"
+    paper_world="action_mode=absolute cube_mass=0.02 finger_friction=0.1 goal_yaw=0.7854"
     for seed in 0 1 2 3 4; do
         for encoder in lrn rn attn; do
             a_run push $encoder 2 $seed                        # figure 3, top
@@ -46,8 +48,7 @@ all_runs() {
             a_run push lrn 2 $seed curiosity --set reward_curiosity=10
             a_run push lrn 2 $seed sparse --set reward_distance=0 reward_reach=0 \
                 reward_curiosity=10
-            a_run push lrn 2 $seed paperreward --set reward_distance=250 reward_reach=0 \
-                reward_curiosity=10
+            a_run push lrn 2 $seed paperreward --set $paper_reward
         fi
         if [ $seed -le 1 ]; then
             for N in 0 1 2; do                                 # MLP of figure 1
@@ -63,28 +64,20 @@ all_runs() {
             done
             a_run push lrn 0 $seed noreadout --set auxiliary=0
             a_run push lrn 2 $seed noreadout-paperreward --set auxiliary=0 \
-                reward_distance=250 reward_reach=0 reward_curiosity=10
+                $paper_reward
             a_run push lrn 2 $seed noreadout-curiosity --set auxiliary=0 reward_curiosity=10
             a_run push lrn 2 $seed rawvalues --set normalize_values=False
             a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
             a_run push lrn 2 $seed absolute --set action_mode=absolute
-            a_run push lrn 2 $seed paperworld --set action_mode=absolute cube_mass=0.02 \
-                finger_friction=0.1 goal_yaw=0.7854 \
-                reward_distance=250 reward_reach=0 reward_curiosity=10
-            a_run push lrn 2 $seed paperworld-ppo --set action_mode=absolute cube_mass=0.02 \
-                finger_friction=0.1 goal_yaw=0.7854 \
-                reward_distance=250 reward_reach=0 reward_curiosity=10 \
+            a_run push lrn 2 $seed paperworld --set $paper_world $paper_reward
+            a_run push lrn 2 $seed paperworld-ppo --set $paper_world $paper_reward \
                 lr=2.5e-4 clip=0.5 anneal_clip=True epochs=4 minibatches=40 adam_eps=1e-8 \
                 log_std=0
-            a_run push lrn 2 $seed paperworld-std --set action_mode=absolute cube_mass=0.02 \
-                finger_friction=0.1 goal_yaw=0.7854 \
-                reward_distance=250 reward_reach=0 reward_curiosity=10 log_std=0
-            a_run push lrn 2 $seed paperworld-30s --set action_mode=absolute cube_mass=0.02 \
-                finger_friction=0.1 goal_yaw=0.7854 \
-                reward_distance=250 reward_reach=0 reward_curiosity=10 \
+            a_run push lrn 2 $seed paperworld-std --set $paper_world $paper_reward log_std=0
+            a_run push lrn 2 $seed paperworld-30s --set $paper_world $paper_reward \
                 substeps=3 timestep=0.004 episode_steps=2500 steps=2500 envs=2
             a_run push lrn 2 $seed slippery --set cube_mass=0.02 finger_friction=0.1 \
-                reward_distance=250 reward_reach=0 reward_curiosity=10
+                $paper_reward
             a_run push lrn 2 $seed paper --paper                # the printed recipe, 60 M frames
             a_run push lrn 2 $seed paper-values --paper --set normalize_values=True
             a_run push lrn 2 $seed paper-normalized --paper --set normalize_values=True \
