@@ -2,7 +2,7 @@
 
     python results/figures.py              every figure that there are numbers for
     python results/figures.py 3            one of them
-    python results/figures.py table        the tables, in markdown
+    python results/figures.py table        the tables of all scores, tables.md
     python results/figures.py 3 --out .    into another folder
 
 Figures have the numbers of the paper's. Needs matplotlib (the tables do not).
@@ -223,12 +223,15 @@ def section_of(run):
 
 
 def print_tables(runs):
+    """Markdown: what results/tables.md holds, and of it results/README.md."""
+    print("# All tables\n\nMade by `python results/figures.py table > results/tables.md`. "
+          "[README.md](README.md) says what the words mean.\n")
     for title in SECTIONS:
         members = [run for run in runs if section_of(run) == title]
         if not members:
             continue
         tables = [training_table(members), *(table(members, measure) for measure in MEASURES)]
-        print(title)
+        print(f"## {title}")
         for lines in tables:
             print("\n" + "\n".join(lines))
         print()

@@ -65,6 +65,8 @@ all_runs() {
             a_run push lrn 0 $seed noreadout --set auxiliary=0
             a_run push lrn 2 $seed noreadout-paperreward --set auxiliary=0 \
                 $paper_reward
+            a_run push lrn 2 $seed noreadout-paperworld --set auxiliary=0 $paper_world \
+                $paper_reward
             a_run push lrn 2 $seed noreadout-curiosity --set auxiliary=0 reward_curiosity=10
             a_run push lrn 2 $seed rawvalues --set normalize_values=False
             a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
