@@ -6,11 +6,12 @@
     python evaluate.py RUN --watch                           watch it play, live in a window
     python evaluate.py RUN --gif push.gif --distractors 9    a film of one episode
 
-Episode j starts from the same seed at every N and for every agent: goal and target cube stand in
-the same places; the distractors differ, and what is drawn after them: identifiers, the target's row
-and a lifting goal's height. The seeds belong to no training run (but one with --seed 20220131). The
-paper does not say whether its scores are of sampled actions or of the policy's means; CausalWorld's
-evaluation plays the means, and so do we. results/README.md explains the table's columns ("Words").
+Episode j starts from the same seed at every N and for every agent: goal, target cube and the first
+distractors stand in the same places; what is drawn after them differs: identifiers, the target's
+row and a lifting goal's height. The seeds belong to no training run (but one with --seed 20220131).
+The paper does not say whether its scores are of sampled actions or of the policy's means;
+CausalWorld's evaluation plays the means, and so do we. results/README.md explains the table's
+columns ("Words").
 """
 import argparse
 import csv
@@ -102,8 +103,8 @@ def trained_z(checkpoint, agent, episodes):
 def drift_of(z, z_trained):
     """Distances of z (B, Z) from z_trained (B, Z), over the mean between two rows of that: (B,).
 
-    Identifiers are drawn after the distractors, so they differ at another N and move z, too. NaN
-    for a single row.
+    Identifiers and a lifting goal's height are drawn after the distractors, so they differ at
+    another N and move z, too. NaN for a single row.
     """
     B = len(z)
     spread = torch.cdist(z_trained, z_trained).sum() / (B * (B - 1))
@@ -374,8 +375,9 @@ def parse_range(text):
     try:
         for part in text.split(","):
             low, _, high = part.partition("-")
-            last = min(int(high or low), len(IDENTIFIERS))     # 0-999999999 must not fill memory
-            numbers.update(range(int(low), last + 1))
+            first, last = int(low), int(high or low)
+            last = min(last, max(first, len(IDENTIFIERS)))     # 0-999999999 must not fill memory
+            numbers.update(range(first, last + 1))
     except ValueError:
         fail(f"--distractors must look like 0-9 or 0,2,5, got {text!r}")
     if not numbers:

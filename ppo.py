@@ -257,8 +257,7 @@ class PPO(nn.Module):
         """The last rollout as (B, ...) tensors with normalised returns and advantages.
 
         Also updates the running moments. rollout() scaled the values with the old moments; the
-        targets here are normalised with the new ones. But for the first few updates they differ
-        little.
+        targets here are normalised with the new ones. After the first few updates both are close.
         """
         batch = {key: value.flatten(0, 1) for key, value in self.batch.items()}
         returns, advantages = batch["returns"], batch["advantages"]

@@ -3147,7 +3147,7 @@ def test_sampled_actions_are_saved_apart(trained, tmp_path, command):
 
 def test_ranges_of_distractors():
     for text, expected in (("0-3", [0, 1, 2, 3]), ("14,2,5", [2, 5, 14]), ("0-2,1-3,9",
-                           [0, 1, 2, 3, 9]), ("7", [7])):
+                           [0, 1, 2, 3, 9]), ("7", [7]), ("5,25", [5, 25])):
         assert evaluate.parse_range(text) == expected
 
 

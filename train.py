@@ -54,7 +54,7 @@ SETTINGS = {
     "steps": Setting(125, 2500, "T, steps of a rollout: one episode"),
     # The environment
     "episode_steps": Setting(125, 2500, "5 s, not 30 s (4.1): more episodes show more goals"),
-    "substeps": Setting(5, 3, "25 Hz, not 83.3 (4.1, CW): noise moves further"),
+    "substeps": Setting(5, 3, "25 Hz, not 83.3 (4.1, CW): held longer, noise moves more"),
     "timestep": Setting(0.008, 0.004, "s; CW: 0.004; a step costs as much, and is sound (tested)"),
     "action_mode": Setting("integrated", "absolute", "targets that stay keep a grip; CW: absolute"),
     "action_scale": Setting(0.1, 0.1, "rad, largest step of an action"),
@@ -62,8 +62,8 @@ SETTINGS = {
     "finger_friction": Setting(1.0, 0.1, "IsaacGymEnvs; CW: 0.1, which holds no 0.08 kg"),
     "goal_yaw": Setting(0.0, math.pi / 4, "rad, largest; 0: place alone (4.1: a pose; CW: any)"),
     "reward_overlap": Setting(100.0, 100.0, "alpha_1 (A.1)"),
-    "reward_distance": Setting(5000.0, 250.0, "alpha_2 (A.1): as printed, 2 mm are worth 0.5"),
-    "reward_curiosity": Setting(0.0, 10.0, "alpha_3 (A.1): never positive, pays for throwing"),
+    "reward_distance": Setting(5000.0, 250.0, "alpha_2 (A.1); at 250, 2 mm are worth 0.5"),
+    "reward_curiosity": Setting(0.0, 10.0, "alpha_3 (A.1): a penalty, smaller for a fast cube"),
     "reward_reach": Setting(2500.0, 0.0, "ours: fingertips towards the cube, as CW has it"),
     # PPO
     "lr": Setting(2e-3, 2.5e-4, "A.2; ours takes fewer frames"),
@@ -157,7 +157,7 @@ class Agent(nn.Module):
     obs {"cubes" (B, N+1, 18), "fingers" (B, 3, 10), "goal" (B, 12)}
     -> mean (B, 9), log_std (9,), value (B,)
 
-    `encoder` is a name in ENCODERS; `distractors` matters to "mlp" alone.
+    `encoder` is a name in ENCODERS; `distractors` is N in training; only "mlp" is built for it.
     """
 
     def __init__(self, encoder, distractors, settings):
@@ -530,7 +530,7 @@ def train(args, settings):
 # ---- the command line
 
 def fail(message, status=2):
-    """End with one line and status 2, as argparse does."""
+    """End with one line and a status: 2 for bad input, as argparse does."""
     print(f"{os.path.basename(sys.argv[0])}: error: {message}", file=sys.stderr)
     sys.exit(status)
 
@@ -650,7 +650,7 @@ def check_resume(args, settings):
     started_with = checkpoint["settings"]
     changed = [f"{name}={started_with[name]}" for name in settings
                if settings[name] != started_with[name]]
-    # A bare --resume takes the run's own settings; those that are named must agree.
+    # Without settings --resume takes the run's own; a command with some must give all of them.
     if changed and (args.set or args.paper or args.frames is not None):
         fail(f"--resume: {file} was started with other settings: {', '.join(changed)}")
     if args.ranks not in (None, checkpoint["ranks"]):
