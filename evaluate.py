@@ -9,10 +9,9 @@
 Episode j starts from the same seed at every N and for every agent: goal, target cube and the first
 distractors stand in the same places (unless a crowd has to be nudged). What is drawn after them
 differs: identifiers, the target's row and a lifting goal's height. The seeds belong to no training
-run (but one with --seed 20220131).
-The paper does not say whether its scores are of sampled actions or of the policy's means;
-CausalWorld's evaluation plays the means, and so do we. results/README.md explains the table's
-columns ("Words").
+run (but one with --seed 20220131). The paper does not say whether its scores are of sampled actions
+or of the policy's means; CausalWorld's evaluation plays the means, and so do we. results/README.md
+explains the table's columns ("Words").
 """
 import argparse
 import csv
