@@ -3489,7 +3489,8 @@ def test_tables_of_the_notebook_are_those_of_the_files():
     searched = run("results/search.py")
     assert searched.returncode == 0, searched.stderr
     assert len(table_rows(searched.stdout)) > 10
-    assert set(table_rows(searched.stdout)) <= set(notebook)
+    with open(os.path.join(HERE, "results", "search", "README.md")) as file:
+        assert set(table_rows(searched.stdout)) <= set(table_rows(file.read()))
     with open(os.path.join(HERE, "results", "screen.csv"), newline="") as file:   # takes too long
         _, *rows = csv.reader(file)
     assert len(rows) == 20 and {"| " + " | ".join(row) + " |" for row in rows} <= set(notebook)

@@ -67,6 +67,10 @@ all_runs() {
                 $paper_reward
             a_run push lrn 2 $seed noreadout-paperworld --set auxiliary=0 $paper_world \
                 $paper_reward
+            a_run push lrn 2 $seed noreadout-slippery --set auxiliary=0 cube_mass=0.02 \
+                finger_friction=0.1 $paper_reward
+            a_run push lrn 2 $seed noreadout-absolute --set auxiliary=0 action_mode=absolute \
+                $paper_reward
             a_run push lrn 2 $seed noreadout-curiosity --set auxiliary=0 reward_curiosity=10
             a_run push lrn 2 $seed rawvalues --set normalize_values=False
             a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
