@@ -66,6 +66,7 @@ SECTIONS = {                             # of the tables -> groups of runs; the 
                 "sparse|paperreward)$",
     "What we added": "-(noreadout|rawvalues|rawadvantages|absolute|slippery|"
                      "paper|paperworld)(-[a-z0-9]+)?$",
+    "How far does lifting come": "lift-.*-n0$",
     "Beyond the paper": "",
 }
 KINDS = {                                # of relations -> colour, those of the paper's figure 7
