@@ -7,6 +7,7 @@ Run:    pytest -q                                        3 to 4 minutes on 2 cor
 """
 import ast
 import csv
+import functools
 import io
 import itertools
 import math
@@ -31,6 +32,7 @@ import ppo
 import train
 import trifinger_env as tri
 from attn import ATTN
+from evaluate import as_batch
 from lrn import LRN, LRNMax
 from ppo import PPO, PointOnLine, TinyAgent, gae, normal_log_prob
 from rn import RN
@@ -41,6 +43,12 @@ HERE = os.path.dirname(os.path.abspath(__file__))
 MODULES = ("lrn.py", "rn.py", "attn.py", "ppo.py", "trifinger_env.py", "train.py", "evaluate.py")
 D = 64
 torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def same_numbers():
+    """Each test starts with the same random numbers of torch, so that a red one can be repeated."""
+    torch.manual_seed(0)
 
 
 def run(*command, cwd=HERE, timeout=120, **more):
@@ -70,19 +78,13 @@ def files_below(folder):
     return found
 
 
-def as_batch(observations):
-    return {key: torch.from_numpy(np.stack([obs[key] for obs in observations]))
-            for key in observations[0]}
-
-
-def is_uniform(values, low=0.0, high=1.0, buckets=10):
+def is_uniform(values, low=0.0, high=1.0):
     """Chi-square test of a uniform law; values outside [low, high] fail it.
 
     With 9 degrees of freedom 27.9 is exceeded by chance once in 1000.
     """
-    assert buckets == 10
-    counts, _ = np.histogram(values, buckets, (low, high))
-    expected = len(values) / buckets
+    counts, _ = np.histogram(values, 10, (low, high))
+    expected = len(values) / 10
     return counts.sum() == len(values) and (np.square(counts - expected) / expected).sum() < 27.9
 
 
@@ -297,7 +299,6 @@ def test_relations_grow_linearly_in_lrn_and_quadratically_in_rn():
 @pytest.mark.parametrize("kind", ["lrn", "lrn-max", "rn", "attn"])
 def test_z_varies_with_the_state_from_the_start(kind):
     """PyTorch's default weights give LRN and RN a z that is nearly constant; ours must not."""
-    torch.manual_seed(0)
     agent = train.Agent(kind, 2, train.DEFAULTS)
     env = TriFingerEnv()
     obs = as_batch([env.reset(seed=seed)[0] for seed in range(40)])
@@ -335,7 +336,7 @@ def put(env, cube, position, quaternion=STILL, velocity=(0, 0, 0), spin=(0, 0, 0
     pb.resetBaseVelocity(body, velocity, spin, **env._world)
 
 
-def pose(env, cube):
+def pose_of(env, cube):
     """Position and quaternion of cube number `cube`, from PyBullet."""
     return pb.getBasePositionAndOrientation(env._cubes[cube], **env._world)
 
@@ -435,14 +436,15 @@ def test_mass_and_friction_are_those_asked_for(options, mass, friction):
     env.close()
 
 
-@pytest.mark.parametrize("substeps, dt", [(5, 0.008), (3, 0.004)])
-def test_a_cube_falls_by_gravity_for_the_time_of_a_step(substeps, dt):
+@pytest.mark.parametrize("substeps, dt, rate", [(5, 0.008, 25), (3, 0.004, 83)])
+def test_a_cube_falls_by_gravity_for_the_time_of_a_step(substeps, dt, rate):
     """h = g t^2 / 2; in discrete steps of dt it is g t (t + dt) / 2."""
     env = TriFingerEnv(distractors=0, substeps=substeps, timestep=dt)
+    assert env.metadata["render_fps"] == rate
     env.reset(seed=0)
     put(env, 0, (0, 0, 0.7))
     env.step(np.zeros(9))
-    fallen = 0.7 - pose(env, 0)[0][2]
+    fallen = 0.7 - pose_of(env, 0)[0][2]
     env.close()
     t = substeps * dt
     assert fallen == pytest.approx(9.81 * t * (t + dt) / 2, rel=1e-3)
@@ -458,10 +460,10 @@ def test_friction_of_a_cube_on_the_floor(env, share, slides):
     set_joints(env, (0.0, 1.4, -1.0) * 3)
     force = share * 0.5 * 0.08 * 9.81
     for _ in range(60):
-        at, _ = pose(env, 0)
+        at, _ = pose_of(env, 0)
         pb.applyExternalForce(env._cubes[0], -1, [force, 0, 0], at, pb.WORLD_FRAME, **env._world)
         pb.stepSimulation(**env._world)
-    moved = pose(env, 0)[0][0]
+    moved = pose_of(env, 0)[0][0]
     assert (moved > 0.01) == slides, moved
 
 
@@ -558,7 +560,7 @@ def test_cubes_rest_without_jitter():
     for cube in range(3):
         speeds = pb.getBaseVelocity(env._cubes[cube], **env._world)
         assert np.abs(speeds).max() < 1e-3
-        assert abs(pose(env, cube)[0][2] - tri.CUBE / 2) < 1e-4
+        assert abs(pose_of(env, cube)[0][2] - tri.CUBE / 2) < 1e-4
     env.close()
 
 
@@ -597,7 +599,7 @@ def pushed(timestep):
         pushing = tri.inverse_kinematics(0, start + step * timestep * heading)
         drive(env, env._fingers, [*pushing, *lifted])
         let_run(env, 1)
-    end = np.array(pose(env, 0)[0])
+    end = np.array(pose_of(env, 0)[0])
     env.close()
     return end
 
@@ -628,7 +630,7 @@ def grasp_and_raise(task, depth=0.02, **physics):
     heights = []
     for _ in range(50):
         env.step(np.zeros(9))
-        heights.append(pose(env, 0)[0][2])
+        heights.append(pose_of(env, 0)[0][2])
     env.close()
     return np.array(heights)
 
@@ -663,7 +665,7 @@ def drawn(link):
         yield centre - half * along, centre + half * along, float(shape.get("radius"))
 
 
-def gap(point, link):
+def gap_to(point, link):
     """Distance (m) from a point to what is drawn of a link; 0 inside."""
     gaps = []
     for start, end, radius in drawn(link):
@@ -697,19 +699,14 @@ def test_the_robots_drawn_parts_are_joined_from_the_mount_to_the_tip():
     for joint in robot.findall("joint"):
         place = np.array(joint.find("origin").get("xyz").split(), float)
         parent, child = (links[joint.find(end).get("link")] for end in ("parent", "child"))
-        assert gap(place, parent) < 0.003, joint.get("name")
-        assert gap(np.zeros(3), child) < 0.003, joint.get("name")
+        assert gap_to(place, parent) < 0.003, joint.get("name")
+        assert gap_to(np.zeros(3), child) < 0.003, joint.get("name")
     assert all(map(hangs_together, links.values()))
-    assert gap(np.array([0, -0.008, -0.16]), links["lower"]) == 0          # the tip
+    assert gap_to(np.array([0, -0.008, -0.16]), links["lower"]) == 0       # the tip
     away = np.array([0.05, 0.05, 0.0])
-    assert gap(away, links["lower"]) > 0.03                    # and the measure can tell
+    assert gap_to(away, links["lower"]) > 0.03                 # and the measure can tell
     for x, y, _ in tri.FINGER_MOUNT:                           # bars meet in the robot's centre
-        assert gap(np.array([math.hypot(x, y), 0, 0]), links["base"]) == 0
-
-
-def test_the_robots_file_has_short_lines():
-    """Bullet reads a URDF in pieces of at most 8191 characters of a line and cuts names apart."""
-    assert max(map(len, tri.finger_urdf().splitlines())) < 8192
+        assert gap_to(np.array([math.hypot(x, y), 0, 0]), links["base"]) == 0
 
 
 def test_only_lower_links_can_touch_things(env):
@@ -816,6 +813,7 @@ def test_nothing_overlaps_at_the_start(n):
 
 
 def test_candidates_are_uniform_by_area_and_in_every_direction(env):
+    env._np_random = np.random.default_rng(0)
     x, y, yaw, half = env._draw_squares(0.2, 0.5, count=5000).T
     assert is_uniform((x * x + y * y) / 0.2 ** 2)
     assert is_uniform(np.arctan2(y, x), -math.pi, math.pi)
@@ -829,7 +827,7 @@ def starts(count, **options):
     goals, targets, heights = [], [], []
     for episode in range(count):
         env.reset(seed=None if episode else 0)
-        for found, (position, q) in ((goals, env.goal), (targets, pose(env, env.target))):
+        for found, (position, q) in ((goals, env.goal), (targets, pose_of(env, env.target))):
             found.append([*position[:2], 2 * math.atan2(q[2], q[3])])
         heights.append(env.goal[0][2])
     env.close()
@@ -838,7 +836,7 @@ def starts(count, **options):
 
 def test_goals_are_uniform_where_a_finger_can_get_behind_them():
     """Against rejection by hand: uniform in a disc of 0.124 m, except on the three fingertips."""
-    goals, targets, heights = starts(2000, distractors=0)
+    goals, _, heights = starts(2000, distractors=0)
     rng = np.random.default_rng(1)
     x, y = rng.uniform(-0.124, 0.124, (2, 200_000))
     possible = np.hypot(x, y) < 0.124
@@ -851,6 +849,10 @@ def test_goals_are_uniform_where_a_finger_can_get_behind_them():
                           (np.hypot(*goals[:, :2].T), np.hypot(x, y))):
         assert is_uniform(np.searchsorted(np.sort(by_hand), ours) / len(by_hand))
     assert not goals[:, 2].any() and (heights == tri.CUBE / 2).all()
+
+
+def test_targets_start_where_goals_lie_and_are_turned():
+    _, targets, _ = starts(2000, distractors=0)
     reach = np.hypot(*targets[:, :2].T)
     assert 0.95 * 0.124 < reach.max() < 0.124
     # A free target is turned anyhow; beside the goal some turns do not fit.
@@ -875,21 +877,24 @@ def test_distractors_lie_anywhere_in_the_arena():
     radius = []
     for episode in range(500):
         env.reset(seed=None if episode else 0)
-        radius.append(np.hypot(*pose(env, 1 - env.target)[0][:2]))
+        radius.append(np.hypot(*pose_of(env, 1 - env.target)[0][:2]))
     env.close()
     assert max(radius) > 0.195 and min(radius) < 0.04
     assert np.mean(np.array(radius) > 0.124) > 0.55
 
 
-def test_goal_and_target_do_not_depend_on_the_number_of_distractors():
+def test_goal_target_and_first_distractors_do_not_depend_on_how_many_there_are():
     for seed in range(5):
-        places = []
+        places = {}
         for n in (0, 2, 9):
             env = TriFingerEnv(distractors=n)
             env.reset(seed=seed)
-            places.append([env.goal[0][:2], pose(env, env.target)[0][:2]])
+            others = [cube for cube in range(n + 1) if cube != env.target]
+            cubes = [pose_of(env, cube)[0][:2] for cube in (env.target, *others)]
+            places[n] = np.array([env.goal[0][:2], *cubes])
             env.close()
-        assert np.ptp(np.array(places), axis=0).max() < 1e-9
+        for n in (0, 2):
+            assert np.abs(places[n] - places[9][:n + 2]).max() < 1e-9
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 5, 9, 20])
@@ -911,7 +916,7 @@ def test_the_goal_names_the_target_and_no_other_cube(n):
         assert np.abs(identifiers[:, None] - pool).min(axis=1).max() < 1e-6
         np.testing.assert_allclose(0.2 * obs["cubes"][env.target, 4:6], poses[1, :2], atol=1e-6)
         for cube in range(n + 1):                              # a row is the cube it says
-            position, _ = pose(env, cube)
+            position, _ = pose_of(env, cube)
             np.testing.assert_allclose(0.2 * obs["cubes"][cube, 4:7], position, atol=1e-6)
         drawn.append(env.target)
         used += identifiers.tolist()
@@ -936,9 +941,9 @@ def test_every_episode_starts_at_rest(env):
         assert not obs["cubes"][:, 11:17].any() and not obs["fingers"][:, 3:6].any()
         np.testing.assert_allclose(angles(env), (0.0, 0.55, -0.7) * 3, atol=1e-9)
         for cube in range(3):
-            (_, _, z), quaternion = pose(env, cube)
+            (_, _, z), quaternion = pose_of(env, cube)
             assert z == pytest.approx(tri.CUBE / 2) and quaternion[:2] == (0, 0)
-        rho = tri.aabb_overlap(pose(env, env.target), env.goal)
+        rho = tri.aabb_overlap(pose_of(env, env.target), env.goal)
         assert info == {"fractional_success": pytest.approx(rho)}
 
 
@@ -972,26 +977,32 @@ def moving(env):
     put(env, 0, (0.02, 0.03, 0.2), quaternion, velocity=(0.1, 0.2, -0.3), spin=(3, 2, 1))
     put(env, 1, (-0.05, 0.01, 0.3), velocity=(-0.3, 0.1, 0.2), spin=(-1, 2, -3))
     obs, *_ = env.step(np.linspace(-1, 1, 9))
-    assert quaternion[3] < 0 and pose(env, 0)[1][3] < 0        # PyBullet shows the sign as it was
+    assert quaternion[3] < 0 and pose_of(env, 0)[1][3] < 0     # PyBullet shows the sign as it was
     return obs
 
 
+# Table 1 and what its numbers are divided by: 0.065 m, 0.2 m, 0.5 m/s, 10 rad/s, 1.5 rad are 1.
+CUBE_UNITS = [1, *[0.065] * 3, *[0.2] * 3, *[1] * 4, *[0.5] * 3, *[10] * 3, 1]
+FINGER_UNITS = [*[1.5] * 3, *[10] * 3, 1, *[0.2] * 3]
+GOAL_UNITS = [1, *[0.065] * 3, *[0.2] * 3, *[1] * 4, 1]
+
+
 def test_observation_is_table_1(env):
-    """Every entry against PyBullet's own state, with the scaling undone."""
+    """Every entry against PyBullet's own state, with the scaling undone by hand."""
     obs = moving(env)
     form = {key: (value.shape, value.dtype) for key, value in obs.items()}
     assert form == {"cubes": ((3, 18), np.float32), "fingers": ((3, 10), np.float32),
                     "goal": ((12,), np.float32)}
     size = [0.065] * 3
-    for cube, row in enumerate(obs["cubes"] * tri.CUBE_SCALE):
-        position, quaternion = pose(env, cube)
+    for cube, row in enumerate(obs["cubes"] * CUBE_UNITS):
+        position, quaternion = pose_of(env, cube)
         if quaternion[3] < 0:                                  # q and -q are the same turn
             quaternion = -np.array(quaternion)
         linear, angular = pb.getBaseVelocity(env._cubes[cube], **env._world)
         identifier = env._ids[cube]
         expected = [1, *size, *position, *quaternion, *linear, *angular, identifier]
         np.testing.assert_allclose(row, expected, atol=1e-5)
-    rows = obs["fingers"] * tri.FINGER_SCALE
+    rows = obs["fingers"] * FINGER_UNITS
     states = joints(env)
     for k, row in enumerate(rows):
         q = [state[0] for state in states[3 * k:3 * k + 3]]
@@ -1002,38 +1013,23 @@ def test_observation_is_table_1(env):
         np.testing.assert_allclose(row[7:], fingertip(env, k), atol=1e-5)
     position, quaternion = env.goal
     expected = [1, *size, *position, *quaternion, env._ids[env.target]]
-    np.testing.assert_allclose(obs["goal"] * tri.GOAL_SCALE, expected, atol=1e-5)
+    np.testing.assert_allclose(obs["goal"] * GOAL_UNITS, expected, atol=1e-5)
 
 
-def test_observation_is_scaled_by_fixed_numbers(env):
-    """0.065 m of size, 0.2 m, 0.5 m/s, 10 rad/s, 1.5 rad are 1; by position in the row."""
+def test_columns_are_picked_out_by_their_names(env):
+    """What train.py and evaluate.py read by name; the columns themselves are tested above."""
     obs = moving(env)
-    row, (position, _) = obs["cubes"][0], pose(env, 0)
-    linear, angular = pb.getBaseVelocity(env._cubes[0], **env._world)
-    np.testing.assert_allclose(row[:4], 1, atol=1e-6)
-    np.testing.assert_allclose(row[4:7], np.array(position) / 0.2, atol=1e-5)
-    np.testing.assert_allclose(row[11:14], np.array(linear) / 0.5, atol=1e-5)
-    np.testing.assert_allclose(row[14:17], np.array(angular) / 10, atol=1e-5)
-    q, dq, *_ = joints(env)[4]
-    finger = obs["fingers"][1]
+    row = (obs["cubes"] * CUBE_UNITS)[1]
+    position, quaternion = pose_of(env, 1)
+    linear, angular = pb.getBaseVelocity(env._cubes[1], **env._world)
+    for columns, expected in ((tri.SIZE, [0.065] * 3), (tri.POSITION, position),
+                              (tri.QUATERNION, quaternion), (tri.LINEAR, linear),
+                              (tri.ANGULAR, angular), (tri.IDENTIFIER, env._ids[1])):
+        np.testing.assert_allclose(row[columns], expected, atol=1e-5)
+    fingers = obs["fingers"] * FINGER_UNITS
+    assert fingers[:, tri.FINGER_IDENTIFIER].tolist() == [-1, 0, 1]
     set_joints(env, env._joint_targets)
-    expected = [q / 1.5, dq / 10, 0, fingertip(env, 1)[2] / 0.2]
-    np.testing.assert_allclose(finger[[1, 4, 6, 9]], expected, atol=1e-5)
-    goal = obs["goal"]
-    expected = [1, env.goal[0][0] / 0.2, 1, env._ids[env.target]]
-    np.testing.assert_allclose(goal[[3, 4, 10, 11]], expected, atol=1e-5)
-
-
-def test_names_of_columns_are_those_of_table_1():
-    """What train.py and evaluate.py read by name: positions, velocities, identifiers."""
-    cube, finger = np.arange(18), np.arange(10)
-    assert cube[tri.SIZE].tolist() == [1, 2, 3]
-    assert cube[tri.POSITION].tolist() == [4, 5, 6]
-    assert cube[tri.QUATERNION].tolist() == [7, 8, 9, 10]
-    assert cube[tri.LINEAR].tolist() == [11, 12, 13]
-    assert cube[tri.ANGULAR].tolist() == [14, 15, 16]
-    assert cube[tri.IDENTIFIER] == 17
-    assert finger[tri.FINGER_IDENTIFIER] == 6 and finger[tri.FINGERTIP].tolist() == [7, 8, 9]
+    np.testing.assert_allclose(fingers[2, tri.FINGERTIP], fingertip(env, 2), atol=1e-5)
 
 
 @pytest.mark.parametrize("mode, options, scale", [
@@ -1062,13 +1058,16 @@ def test_actions_ask_for_the_angles_they_should(monkeypatch, mode, options, scal
             else:
                 target = (low + high) / 2 + action * (high - low) / 2
             np.testing.assert_allclose(asked, target, atol=1e-9)
+    env.close()
+
+
+def test_joint_targets_stay_within_the_joints_limits(env):
+    env.reset(seed=0)
     set_joints(env, (0.9, -1.1, 2.9) * 3)
     env._read()
-    asked.clear()
     env._joint_targets = list((0.95, -1.15, 2.95) * 3)
     env.step(np.array([1, -1, 1] * 3))
-    np.testing.assert_allclose(asked, (1.0, -1.2, 3.0) * 3, atol=1e-9)     # the joints' limits
-    env.close()
+    np.testing.assert_allclose(env._joint_targets, (1.0, -1.2, 3.0) * 3, atol=1e-9)
 
 
 def test_fingertips_are_seen_where_they_are_told_to_be_if_targets_stay():
@@ -1113,12 +1112,12 @@ def test_reward_terms_add_up_and_follow_their_formulas(weights):
         put(env, env.target, np.add(goal, [0.002 * t, 0.001, 0.0]), velocity=(0.1, 0.2, 0.0))
         env._read()
         env._moment = env._measure()
-        before, _ = pose(env, env.target)
+        before, _ = pose_of(env, env.target)
         tips_before = [fingertip(env, k) for k in range(3)]
         _, reward, _, _, info = env.step(np.sin(np.arange(9) + t / 3))
-        after, _ = pose(env, env.target)
+        after, _ = pose_of(env, env.target)
         tips_after = [fingertip(env, k) for k in range(3)]
-        rho = tri.aabb_overlap(pose(env, env.target), env.goal)
+        rho = tri.aabb_overlap(pose_of(env, env.target), env.goal)
         expected = {
             "overlap": rho,
             "distance": math.dist(before, goal) - math.dist(after, goal),
@@ -1139,24 +1138,13 @@ def test_moments_of_consecutive_steps_follow_each_other():
     """A step's rewards start from where the last step ended: they add up over an episode."""
     env = TriFingerEnv(distractors=0, reward_weights={"distance": 1.0, "reach": 1.0})
     env.reset(seed=0)
-    first, _ = pose(env, 0)
+    first, _ = pose_of(env, 0)
     start = math.dist(first, env.goal[0])
     total = sum(env.step(np.sin(np.arange(9) + t / 3))[4]["rewards"]["distance"]
                 for t in range(40))
-    last, _ = pose(env, 0)
+    last, _ = pose_of(env, 0)
     assert total == pytest.approx(start - math.dist(last, env.goal[0]), abs=1e-9)
     env.close()
-
-
-def test_distance_term_pays_for_moving_towards_the_goal(env):
-    for sign in (1, -1):
-        env.reset(seed=2)
-        position, _ = pose(env, env.target)
-        towards = np.subtract(env.goal[0], position)
-        speed = sign * 0.3 * towards / np.linalg.norm(towards)
-        put(env, env.target, position, velocity=speed)
-        _, _, _, _, info = env.step(np.zeros(9))
-        assert sign * info["rewards"]["distance"] > 0
 
 
 # ---------------------------------------------------------------- the end of an episode
@@ -1294,18 +1282,6 @@ def test_actions_that_are_not_nine_finite_numbers_are_refused():
         env.render()
     env.close()
     env.close()                                                # twice is harmless
-
-
-def test_paper_rate_is_available():
-    """30 s of 2500 actions (A.1): 83.3 Hz."""
-    env = TriFingerEnv(episode_steps=2500, substeps=3, timestep=0.004, action_mode="absolute",
-                       distractors=0)
-    assert env.metadata["render_fps"] == 83
-    env.reset(seed=0)
-    for t in range(2500):
-        _, _, _, truncated, _ = env.step(np.zeros(9))
-        assert truncated == (t == 2499)
-    env.close()
 
 
 def test_picture_shows_target_goal_and_distractors_in_their_colours():
@@ -1715,11 +1691,6 @@ def test_learning_rate_and_clip_range_shrink_with_the_training_that_is_left(powe
     assert clips == [pytest.approx(0.05 if anneal else 0.2)]
 
 
-def test_clip_range_stays_by_default_while_the_learning_rate_shrinks():
-    learner = PPO(TinyAgent(), [None], minibatches=1)
-    assert learner.lr_power == 1 and not learner.anneal_clip
-
-
 def test_an_auxiliary_loss_without_weight_is_never_asked_for():
     agent = Fixed()
     agent.auxiliary = None                                     # calling it would fail
@@ -1731,7 +1702,6 @@ def test_an_auxiliary_loss_without_weight_is_never_asked_for():
 @pytest.mark.parametrize("largest", [0.2, 1e6])
 def test_update_on_one_vector_of_weights_equals_torch_layer_by_layer(largest):
     """Three steps of update() against torch's own clipping and Adam over the list of parameters."""
-    torch.manual_seed(0)
     learner = PPO(TinyAgent(), [PointOnLine() for _ in range(4)], steps=8, epochs=3, minibatches=1,
                   lr=1e-2, adam_eps=1e-2, max_grad_norm=largest)
     learner.agent.load_state_dict(learner.agent.state_dict())  # must keep weights in the vector
@@ -1760,7 +1730,6 @@ def test_update_on_one_vector_of_weights_equals_torch_layer_by_layer(largest):
 
 def test_ppo_solves_the_line():
     """Best possible: about 3.6 moves of 0.2 to a random target; at random it ends far away."""
-    torch.manual_seed(0)
     learner = PPO(TinyAgent(), [PointOnLine() for _ in range(8)], steps=64, lr=3e-3)
     gaps = []
     for update in range(25):
@@ -1865,18 +1834,6 @@ def test_agent_is_an_mlp_per_type_an_encoder_and_two_heads(env):
         same(value[b], agent.value(z)[0])
 
 
-@pytest.mark.parametrize("kind", ["lrn", "lrn-max", "rn", "attn"])
-def test_agent_does_not_care_for_the_order_of_the_cubes(kind, env):
-    agent = train.Agent(kind, 2, train.DEFAULTS)
-    obs = observations(env)
-    mean, _, value = agent(obs)
-    swapped, _, same_value = agent({**obs, "cubes": obs["cubes"][:, [2, 0, 1]]})
-    same(swapped, mean)
-    same(same_value, value)
-    fewer, _, _ = agent({**obs, "cubes": obs["cubes"][:, :2]})
-    assert (fewer - mean).abs().max() > 1e-6
-
-
 def test_mlp_agent_sees_everything_and_has_a_fixed_input(env):
     agent = train.Agent("mlp", 2, train.DEFAULTS)
     obs = observations(env)
@@ -1929,9 +1886,17 @@ def test_settings_reach_the_encoder():
             assert made(objects, goal).shape == (2, 10)
             wide = encoder(kind, token_dim=128)(objects.repeat(1, 1, 2), goal.repeat(1, 2))
             assert wide.shape == (2, 25)
+
+
+def test_settings_of_one_encoder_reach_it():
+    def encoder(kind, **settings):
+        return train.Agent(kind, 3, {**train.DEFAULTS, **settings}).encoder
+
+    objects, goal = some(2, 4)
     assert encoder("attn", heads=2).attend(objects, goal)[1].shape == (2, 2, 5, 5)
     blind = encoder("lrn", relations=False)
     assert torch.equal(blind(objects, goal), blind(objects, -goal))
+    assert train.Agent("lrn", 3, {**train.DEFAULTS, "hidden": 32}).policy[0].out_features == 32
     flat = encoder("lrn", layer_norm=False)
     assert flat(100 * objects, 100 * goal).abs().max() > 50    # LayerNorm would hold it below 5
 
@@ -2018,7 +1983,7 @@ def test_derived_seeds_do_not_repeat_where_sums_would():
     seeds = {train.derived_seed(seed, update, stream)
              for seed in range(12) for update in range(12) for stream in range(12)}
     assert len(seeds) == 12 ** 3
-    assert train.derived_seed(0, 1, 2) == train.derived_seed(0, 1, 2)
+    assert train.derived_seed(0, 1, 2) == 3_884_055_042          # on every machine
 
 
 def test_every_rank_draws_other_episodes_and_other_noise():
@@ -2040,7 +2005,7 @@ def test_every_rank_draws_other_episodes_and_other_noise():
     assert torch.randn(1).item() == noises[-1][1]              # and the same again
 
 
-def arguments(**changes):
+def run_arguments(**changes):
     return SimpleNamespace(**{"encoder": "lrn", "task": "push", "distractors": 1, "seed": 0,
                               "out": "nowhere", "resume": False, "save_minutes": 3.0, **changes})
 
@@ -2048,14 +2013,16 @@ def arguments(**changes):
 def test_every_setting_reaches_the_learner_and_its_environments():
     """Each setting with a value of its own."""
     of_ppo = {"steps": 7, "epochs": 2, "minibatches": 3, "lr": 0.1, "clip": 0.3, "discount": 0.4,
-              "lam": 0.5, "value_coef": 0.7, "max_grad_norm": 0.8, "lr_power": 0.6,
+              "lam": 0.5, "value_coef": 0.7, "max_grad_norm": 0.8, "lr_power": 1.5,
               "anneal_clip": True, "normalize_advantages": False, "normalize_values": False}
     of_env = {"episode_steps": 11, "substeps": 2, "timestep": 0.002, "action_mode": "absolute",
-              "action_scale": 0.07, "cube_mass": 0.03, "finger_friction": 0.6, "goal_yaw": 0.12}
+              "action_scale": 0.07, "cube_mass": 0.03, "finger_friction": 0.16, "goal_yaw": 0.12}
     others = {"envs": 6, "adam_eps": 0.2, "entropy": 0.6, "auxiliary": 0.9, "reward_overlap": 1.0,
               "reward_distance": 2.0, "reward_curiosity": 3.0, "reward_reach": 4.0}
+    of_the_agent = {"token_dim", "z_dim", "hidden", "heads", "relations", "layer_norm", "log_std"}
+    assert {*of_ppo, *of_env, *others} == set(train.SETTINGS) - of_the_agent - {"frames"}
     settings = {**train.DEFAULTS, **of_ppo, **of_env, **others}
-    learner = train.make_learner(arguments(task="lift"), settings, ranks=2)
+    learner = train.make_learner(run_arguments(task="lift"), settings, ranks=2)
     for name, value in of_ppo.items():
         assert getattr(learner, name) == value, name
     assert (learner.entropy_coef, learner.auxiliary_coef) == (0.6, 0.9)
@@ -2081,7 +2048,7 @@ def test_the_environment_alone_is_the_one_of_a_run_with_default_settings():
 def test_first_weights_depend_on_the_seed_alone():
     def first_weights(seed):
         settings = {**train.DEFAULTS, "envs": 1, "minibatches": 1}
-        learner = train.make_learner(arguments(seed=seed), settings, 1)
+        learner = train.make_learner(run_arguments(seed=seed), settings, 1)
         learner.envs[0].close()
         return learner.weights
 
@@ -2089,16 +2056,25 @@ def test_first_weights_depend_on_the_seed_alone():
     assert not torch.equal(first_weights(0), first_weights(1))
 
 
-def test_paper_sets_the_numbers_that_the_paper_prints(tmp_path):
-    """A.1 and A.2 by hand, and the 2500 steps of 30 s; --set comes on top."""
+def test_paper_sets_the_numbers_of_the_paper_and_of_its_sources(tmp_path):
+    """Every setting by hand: A.1, A.2, the 2500 steps of 30 s, CausalWorld, rlpyt; --set on top."""
     printed = {"discount": 0.98, "entropy": 0.01, "lr": 0.00025, "value_coef": 0.5,
                "max_grad_norm": 0.5, "minibatches": 40, "lam": 0.95, "clip": 0.5, "epochs": 4,
                "lr_power": 1, "reward_overlap": 100, "reward_distance": 250,
                "reward_curiosity": 10, "reward_reach": 0, "auxiliary": 0, "z_dim": 25,
                "episode_steps": 2500, "relations": True, "layer_norm": True}
+    of_its_sources = {"frames": 60_000_000, "envs": 48, "steps": 2500, "action_mode": "absolute",
+                      "cube_mass": 0.02, "finger_friction": 0.1, "goal_yaw": math.pi / 4,
+                      "anneal_clip": True, "adam_eps": 1e-8, "normalize_advantages": False,
+                      "normalize_values": False, "log_std": 0.0}
+    guesses = {"token_dim": 128, "hidden": 128, "heads": 4}
     out = str(tmp_path / "run")
     _, settings = train.parse(["--paper", "--out", out])
-    assert {name: settings[name] for name in printed} == printed
+    for expected in (printed, of_its_sources, guesses):
+        assert {name: settings[name] for name in expected} == expected
+    without_effect = {"action_scale"}                          # on absolute targets
+    assert set(settings) == {*printed, *of_its_sources, *guesses, "substeps", "timestep",
+                             *without_effect}
     assert settings["substeps"] * settings["timestep"] == pytest.approx(30 / 2500)
     _, settings = train.parse(["--paper", "--out", out, "--set", "z_dim=50", "lr=0.1"])
     assert settings["z_dim"] == 50 and settings["lr"] == 0.1 and settings["clip"] == 0.5
@@ -2118,11 +2094,6 @@ def test_lifting_has_frames_schedule_and_noise_of_its_own(tmp_path):
                           ("--task lift --set frames=7", 7)):
         _, settings = train.parse(["--out", out, *words.split()])
         assert settings["frames"] == frames, words
-
-
-def test_the_default_run_is_named_after_what_it_trains():
-    args = train.read_command(["--task", "lift", "--encoder", "rn", "--seed", "4"])
-    assert args.out == os.path.join("runs", "lift-rn-n2-seed4")
 
 
 def test_as_many_ranks_as_cores_and_batch_allow(monkeypatch):
@@ -2184,7 +2155,7 @@ def mean_gap(agent, settings, episodes=24):
             mean, log_std, _ = agent(as_batch([obs]))
             action = mean[0].numpy() + log_std.exp().numpy() * rng.standard_normal(9)
             obs, _, _, truncated, _ = env.step(action)
-        centre, _ = pose(env, 0)
+        centre, _ = pose_of(env, 0)
         gaps.append(np.mean([math.dist(fingertip(env, k), centre) for k in range(3)]))
     env.close()
     return np.mean(gaps)
@@ -2224,7 +2195,7 @@ def test_first_row_of_two_ranks_is_about_the_episodes_of_both(trained):
     checkpoint, _ = train.load(trained)
     episodes = []
     for rank in range(2):
-        learner = train.make_learner(arguments(distractors=0), checkpoint["settings"], ranks=2)
+        learner = train.make_learner(run_arguments(distractors=0), checkpoint["settings"], ranks=2)
         episodes += learner.rollout(train.reseed(0, 0, rank, 4))
         for env in learner.envs:
             env.close()
@@ -2232,10 +2203,6 @@ def test_first_row_of_two_ranks_is_about_the_episodes_of_both(trained):
     assert row["episodes"] == len(episodes) == 8
     expected = np.mean([episode["return"] for episode in episodes])
     assert row["return"] == pytest.approx(expected, rel=1e-4)
-    for name, key in (("success_aabb", "fractional_success"),
-                      ("success_strict", "fractional_success_strict")):
-        expected = np.mean([episode["info"][key] for episode in episodes])
-        assert row[name] == pytest.approx(expected, rel=1e-4, abs=1e-9)
 
 
 def test_every_update_plays_other_episodes_and_is_told_how_much_is_left(
@@ -2281,7 +2248,7 @@ def test_columns_about_episodes_by_hand():
 
 def test_a_checkpoint_is_due_after_its_minutes(monkeypatch):
     monkeypatch.setattr(time, "monotonic", lambda: 1000.0)
-    due = train.Run(arguments(save_minutes=2.0), train.DEFAULTS, 1, None).is_due
+    due = train.Run(run_arguments(save_minutes=2.0), train.DEFAULTS, 1, None).is_due
     for seconds, expected in ((119, False), (121, True)):
         monkeypatch.setattr(time, "monotonic", lambda: 1000.0 + seconds)
         assert due() == expected
@@ -2325,21 +2292,17 @@ def test_adding_an_encoder_of_ones_own_is_one_line(tmp_path, monkeypatch):
     """A script of one's own trains it, on two ranks; the checkpoint is read where it is known."""
     script, out = tmp_path / "own.py", str(tmp_path / "run")
     script.write_text(OWN_ENCODER.format(here=HERE))
-    unknown = start(str(script), "--encoder", "theirs", "--out", str(tmp_path / "theirs"))
+    unknown = start_process(str(script), "--encoder", "theirs", "--out", str(tmp_path / "theirs"))
     done = run(str(script), "--encoder", "mine", "--ranks", "2", "--frames", "600", "--out", out,
                *SMALL, "z_dim=12")
     assert done.returncode == 0, done.stderr
     with pytest.raises(ValueError, match="mine"):
         train.load(out)
-
-    class Mine(nn.Module):
-        def __init__(self, token_dim, z_dim):
-            super().__init__()
-            self.out = nn.Linear(2 * token_dim, z_dim)
-
-    monkeypatch.setitem(train.ENCODERS, "mine", (Mine, ("token_dim", "z_dim")))
+    monkeypatch.setattr(train, "ENCODERS", dict(train.ENCODERS))           # own.py adds to it
+    monkeypatch.syspath_prepend(tmp_path)
+    import own
     checkpoint, agent = train.load(out)
-    assert checkpoint["update"] == 3 and type(agent.encoder) is Mine
+    assert checkpoint["update"] == 3 and type(agent.encoder) is own.Mine
     assert agent.encoder.out.weight.shape == (12, 128)
     torch.manual_seed(0)
     untrained = train.Agent("mine", 2, checkpoint["settings"])
@@ -2375,7 +2338,7 @@ def wait_for_the_end_of(group):
         time.sleep(0.05)
 
 
-def start(*command, cwd=HERE, env=None):
+def start_process(*command, cwd=HERE, env=None):
     """A command under way, in a process group of its own."""
     return subprocess.Popen([sys.executable, *command], cwd=cwd, env=env, stdout=subprocess.PIPE,
                             stderr=subprocess.PIPE, text=True, start_new_session=True)
@@ -2399,7 +2362,7 @@ def read_updates(process, count):
     return last
 
 
-def end(process, how, whole_group):
+def end_process(process, how, whole_group):
     """Send a signal, wait until nobody is left. Returns the rest of the output."""
     if whole_group:
         os.killpg(process.pid, how)
@@ -2410,13 +2373,13 @@ def end(process, how, whole_group):
     return rest
 
 
-def stop(process, ranks):
+def stop_run(process, ranks):
     """SIGTERM to the first process or Ctrl-C to all: the run ends well, in so many seconds."""
     begin = time.monotonic()
     if ranks == 1:
-        rest = end(process, signal.SIGTERM, whole_group=False)
+        rest = end_process(process, signal.SIGTERM, whole_group=False)
     else:
-        rest = end(process, signal.SIGINT, whole_group=True)
+        rest = end_process(process, signal.SIGINT, whole_group=True)
     seconds = time.monotonic() - begin
     assert process.returncode == 130 and "stopped after" in rest and seconds < 10
     return seconds
@@ -2430,7 +2393,7 @@ def kill(process, folder, rng, while_writing):
             pass
     else:
         time.sleep(rng.uniform(0, 0.3))
-    rest = end(process, signal.SIGKILL, whole_group=True)
+    rest = end_process(process, signal.SIGKILL, whole_group=True)
     return max([seen, *filter(None, map(update_of, rest.splitlines()))])
 
 
@@ -2456,11 +2419,18 @@ def test_a_stop_in_the_middle_of_a_checkpoint_stays_a_stop(tmp_path, monkeypatch
     assert torch.equal(torch.load(path)["x"], torch.zeros(1000))           # the old one
 
 
+def save_changed(run_folder, out, changes, **settings):
+    """Write a run's checkpoint with some of its entries, or settings, changed to folder `out`."""
+    checkpoint = torch.load(os.path.join(run_folder, "checkpoint.pt"), weights_only=True)
+    checkpoint["settings"].update(settings)
+    train.save({**checkpoint, **changes}, os.path.join(out, "checkpoint.pt"))
+
+
 @needs_proc
 @pytest.mark.parametrize("delay", [0.2, 3.0])
 def test_ctrl_c_before_the_first_update_ends_both_ranks(delay, tmp_path):
     """While the second rank is still importing, and later; 60 s are far below gloo's 10 minutes."""
-    process = start("train.py", "--ranks", "2", "--out", str(tmp_path / "run"))
+    process = start_process("train.py", "--ranks", "2", "--out", str(tmp_path / "run"))
     while len(alive(process.pid)) < 3:                         # two ranks and a resource tracker
         time.sleep(0.01)
     time.sleep(delay)
@@ -2485,15 +2455,15 @@ def test_stopped_killed_and_resumed_equals_never_stopped(ranks, tmp_path):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     command = ["train.py", "--distractors", "1", "--ranks", str(ranks), "--save-minutes", "0",
                "--frames", str(200 * updates), *SMALL]
-    never_stopped = start(*command, "--out", str(whole))
+    never_stopped = start_process(*command, "--out", str(whole))
 
-    process = start(*command, "--out", str(cut))
+    process = start_process(*command, "--out", str(cut))
     seen = read_updates(process, 2)
     (cut / "zeroshot.csv").write_text("of the old weights")
-    seconds = stop(process, ranks)
+    seconds = stop_run(process, ranks)
     inside = 0                                                 # kills during the writing
     for number in range(1, kills + 1):
-        process = start(*command, "--out", str(cut), "--resume")
+        process = start_process(*command, "--out", str(cut), "--resume")
         seen = max(seen, kill(process, cut, rng, while_writing=number % 2 == 1))
         inside += os.path.exists(cut / "checkpoint.pt.tmp")
         kept = train.load(str(cut))[0]["update"]
@@ -2513,11 +2483,13 @@ def test_stopped_killed_and_resumed_equals_never_stopped(ranks, tmp_path):
     assert read(whole / "progress.csv") == read(cut / "progress.csv")
 
 
+@pytest.mark.parametrize("options", ["", "--encoder rn --task lift", "--encoder attn",
+                                     "--encoder mlp"])
 def test_a_stop_in_the_middle_of_an_update_goes_back_to_its_beginning(
-        tmp_path, capsys, monkeypatch, command):
+        options, tmp_path, capsys, monkeypatch, command):
     """Weights and moments of Adam have changed by then; what is saved is from before."""
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    words = ["train.py --ranks 1 --frames 800 --distractors 0", *SMALL, "--out"]
+    words = ["train.py --ranks 1 --frames 800 --distractors 0", options, *SMALL, "--out"]
     command(*words, whole)
     step, calls = train.PPO.minibatch_step, []
 
@@ -2545,14 +2517,26 @@ def test_a_stop_in_the_middle_of_an_update_goes_back_to_its_beginning(
 def test_a_stop_does_not_wait_for_a_long_update(ranks, tmp_path):
     """Ten minutes and more for a rollout here; it stops within seconds and leaves nobody behind."""
     out = tmp_path / "run"
-    process = start("train.py", "--ranks", str(ranks), "--out", str(out), "--set", "envs=4",
+    process = start_process("train.py", "--ranks", str(ranks), "--out", str(out), "--set", "envs=4",
                     "steps=500000", "minibatches=4")
     while not os.path.exists(out / "checkpoint.pt"):           # written as the run begins
         assert process.poll() is None
         time.sleep(0.05)
     time.sleep(0.5)
-    stop(process, ranks)
+    stop_run(process, ranks)
     assert train.load(str(out))[0]["update"] == 0
+
+
+def test_overwrite_starts_anew(tmp_path, command):
+    """As if there had been no run before; scores of the old weights go."""
+    fresh, again = tmp_path / "fresh", tmp_path / "again"
+    command("train.py --ranks 1 --frames 200 --seed 1 --out", fresh, *SMALL)
+    command("train.py --ranks 1 --frames 400 --out", again, *SMALL)
+    (again / "zeroshot.csv").write_text("of the old weights")
+    command("train.py --ranks 1 --frames 200 --seed 1 --overwrite --out", again, *SMALL)
+    assert read(again / "progress.csv") == read(fresh / "progress.csv")
+    assert sorted(os.listdir(again)) == sorted(os.listdir(fresh))
+    assert train.load(str(again))[0]["seed"] == 1
 
 
 def test_resuming_a_finished_run_changes_nothing(trained, tmp_path, command, capsys):
@@ -2560,9 +2544,7 @@ def test_resuming_a_finished_run_changes_nothing(trained, tmp_path, command, cap
     shutil.copytree(trained, out)
     (out / "zeroshot.csv").write_text("of these weights")
     before = files_below(out)
-    checkpoint = torch.load(out / "checkpoint.pt", weights_only=True)
-    checkpoint["ranks"] = 1                                    # stay in this process
-    train.save(checkpoint, str(out / "checkpoint.pt"))
+    save_changed(trained, out, {"ranks": 1})                   # stay in this process
     command("train.py --resume --distractors 0 --out", out)
     assert "finished after 40 updates" in capsys.readouterr().out
     after = files_below(out)
@@ -2593,7 +2575,7 @@ def test_torchrun_starts_the_same_file(tmp_path):
 @needs_proc
 @pytest.mark.parametrize("victim", [0, 1])
 def test_a_killed_rank_ends_the_run_and_leaves_nobody_behind(victim, tmp_path):
-    process = start("train.py", "--ranks", "2", "--out", str(tmp_path / "run"), *SMALL)
+    process = start_process("train.py", "--ranks", "2", "--out", str(tmp_path / "run"), *SMALL)
     read_updates(process, 2)
     other, = (pid for pid in alive(process.pid) if b"spawn_main" in read(f"/proc/{pid}/cmdline"))
     os.kill((process.pid, other)[victim], signal.SIGKILL)
@@ -2608,9 +2590,7 @@ def test_a_gradient_that_is_not_finite_ends_the_run_and_keeps_the_checkpoint(
         tmp_path, capsys, monkeypatch, command):
     out = tmp_path / "run"
     command("train.py --ranks 1 --frames 400 --distractors 0 --out", out, *SMALL)
-    checkpoint = torch.load(out / "checkpoint.pt", weights_only=True)
-    checkpoint["settings"]["frames"] = 800                     # two more updates to play
-    train.save(checkpoint, str(out / "checkpoint.pt"))
+    save_changed(out, out, {}, frames=800)                     # two more updates to play
     before = read(out / "checkpoint.pt")
     monkeypatch.setattr(train.Agent, "auxiliary",
                         lambda self, obs: self.log_std.sum() * float("nan"))
@@ -2623,33 +2603,18 @@ def test_a_gradient_that_is_not_finite_ends_the_run_and_keeps_the_checkpoint(
 
 def test_a_checkpoint_that_lacks_a_setting_takes_the_default(trained, tmp_path, command):
     """As one of an older version would. Settings that it has stay as they are."""
-    checkpoint = torch.load(os.path.join(trained, "checkpoint.pt"), weights_only=True)
-    _, expected = train.load(trained)
-    for name in ("reward_reach", "z_dim", "discount"):
-        del checkpoint["settings"][name]
-    checkpoint["ranks"] = 1
+    checkpoint, expected = train.load(trained)
+    few = {name: value for name, value in checkpoint["settings"].items()
+           if name not in ("reward_reach", "z_dim", "discount")}
     out = tmp_path / "run"
     os.mkdir(out)
-    train.save(checkpoint, str(out / "checkpoint.pt"))
+    save_changed(trained, out, {"ranks": 1, "settings": few})
     loaded, agent = train.load(str(out))
     assert loaded["settings"]["reward_reach"] == 2500.0 and loaded["settings"]["discount"] == 0.98
     assert loaded["settings"]["z_dim"] == 25 and loaded["settings"]["envs"] == 8
     for ours, theirs in zip(agent.parameters(), expected.parameters()):
         assert torch.equal(ours, theirs)
     command("train.py --distractors 0 --resume --out", out)    # and it can be resumed
-
-
-def test_weights_without_the_optimizer_can_be_evaluated_only(trained, tmp_path, command, capsys):
-    checkpoint = torch.load(os.path.join(trained, "checkpoint.pt"), weights_only=True)
-    del checkpoint["optimizer"]
-    out = tmp_path / "run"
-    os.mkdir(out)
-    train.save(checkpoint, str(out / "checkpoint.pt"))
-    with pytest.raises(SystemExit) as stop:
-        command("train.py --distractors 0 --resume --out", out)
-    assert stop.value.code == 2 and "evaluated only" in capsys.readouterr().err
-    command("evaluate.py --distractors 0 --episodes 1", out)
-    assert "1 episodes each" in capsys.readouterr().out
 
 
 # ---------------------------------------------------------------- bad input
@@ -2791,12 +2756,6 @@ def test_bad_input_ends_with_one_line_and_status_2(bad, capsys, command, monkeyp
     assert files_below(".") == before
 
 
-def test_bad_input_as_a_user_sees_it():
-    done = run("train.py", "--encoder", "gnn")
-    assert done.returncode == 2 and "Traceback" not in done.stderr
-    assert "'gnn'" in done.stderr and not done.stdout.replace("pybullet build time", "").count("\n")
-
-
 def test_settings_with_an_effect_are_taken(tmp_path):
     for encoder, change in (("lrn", "relations=False"), ("attn", "heads=2"), ("mlp", "hidden=32"),
                             ("rn", "token_dim=32"), ("lrn-max", "z_dim=5"), ("lrn", "hidden=32")):
@@ -2811,7 +2770,13 @@ def test_nothing_is_unpickled_or_downloaded():
     known = {"argparse", "copy", "csv", "datetime", "math", "multiprocessing", "os",
              "shutil", "signal", "socket", "sys", "tempfile", "time", "typing", "numpy", "torch",
              "pybullet", "gymnasium", "PIL", "lrn", "rn", "attn", "ppo", "train", "trifinger_env"}
-    for name in MODULES:
+    of_results = {"cProfile", "evaluate", "figures", "glob", "grasp", "matplotlib", "re", "sklearn",
+                  "stable_baselines3"}
+    scripts = [os.path.join("results", name) for name in os.listdir(os.path.join(HERE, "results"))
+               if name.endswith(".py")]
+    for name in (*MODULES, *scripts):
+        if name in scripts:
+            known = known | of_results
         for node in ast.walk(ast.parse(read(os.path.join(HERE, name)))):
             modules = []
             if isinstance(node, ast.Import):
@@ -2876,17 +2841,17 @@ def simple(monkeypatch):
     return checkpoint
 
 
-def slow_play(checkpoint, n, episodes, sample_actions):
+def slow_play(task, settings, n, episodes, sample_actions):
     """evaluate.play() as a plain loop, one episode after the other."""
     agent, results = Simple(), []
     for episode in episodes:
         seed = int(np.random.SeedSequence([20220131, episode]).generate_state(1)[0])
         other = np.random.SeedSequence([20220131, episode, 1])
         noise = np.random.default_rng(int(other.generate_state(1)[0]))
-        env = train.make_env("push", n, checkpoint["settings"])
+        env = train.make_env(task, n, settings)
         obs, _ = env.reset(seed=seed)
         truncated = False
-        target = np.array(pose(env, env.target)[0])
+        target = np.array(pose_of(env, env.target)[0])
         while not truncated:
             mean, log_std, _ = agent(as_batch([obs]))
             action = mean[0].numpy()
@@ -2899,10 +2864,12 @@ def slow_play(checkpoint, n, episodes, sample_actions):
     return np.array(results)
 
 
-@pytest.mark.parametrize("n, sample_actions", [(0, False), (2, False), (2, True)])
-def test_play_equals_a_plain_loop_over_episodes(simple, n, sample_actions):
+@pytest.mark.parametrize("task, n, sample_actions", [
+    ("push", 0, False), ("push", 2, False), ("push", 2, True), ("lift", 2, False)])
+def test_play_equals_a_plain_loop_over_episodes(simple, task, n, sample_actions):
+    simple["task"] = task
     ours = evaluate.play(simple, Simple(), n, range(3, 9), sample_actions)
-    expected = slow_play(simple, n, range(3, 9), sample_actions)
+    expected = slow_play(task, simple["settings"], n, range(3, 9), sample_actions)
     column = dict(zip(evaluate.Episode._fields, zip(*ours)))
     np.testing.assert_allclose(column["success_aabb"], expected[:, 0], atol=1e-5)
     np.testing.assert_allclose(column["success_strict"], expected[:, 1], atol=1e-5)
@@ -3110,13 +3077,15 @@ def test_evaluation_leaves_a_run_as_it_is_unless_asked_to_save(trained, tmp_path
     assert done.returncode == 0 and files_below(out) == before, done.stderr
     printed = [line.split() for line in done.stdout.splitlines()[-2:]]
     assert [line[0] for line in printed] == ["0", "3"]
+    read_error = float(printed[1][-1])                         # mm
 
     command("evaluate.py", out, "--episodes 3 --distractors 3 --save")
     saved, = read_csv(out / "zeroshot.csv")
+    assert saved["read_error"] == pytest.approx(read_error / 1000, abs=1e-7)
     assert f"{saved['success_aabb']:.3f}" == printed[1][1] and saved["episodes"] == 3
     alone = evaluate.play(*train.load(str(out)), 3, range(3), False)       # in this process
-    expected = np.mean([episode.success_aabb for episode in alone])
-    assert saved["success_aabb"] == pytest.approx(expected, abs=1e-4)
+    expected = np.mean([episode.read_error for episode in alone])
+    assert saved["read_error"] == pytest.approx(expected, abs=1e-4) and expected > 0.01
     assert set(files_below(out)) - set(before) == {str(out / "zeroshot.csv")}
 
 
@@ -3134,15 +3103,36 @@ def test_rows_are_saved_in_order_and_other_n_stay(tmp_path):
                      "9,7" + 11 * ",0.2500"]
 
 
-def test_sampled_actions_are_saved_apart(trained, tmp_path, command):
+def test_sampled_actions_are_saved_apart(tmp_path, command):
+    """By an agent whose scores tell sampled actions from mean ones."""
     out = tmp_path / "run"
-    shutil.copytree(trained, out)
-    command("evaluate.py --sample-actions --save --distractors 0 --episodes 2", out)
+    out.mkdir()
+    shutil.copy(os.path.join(HERE, "results", "push-lrn-n2-seed1", "checkpoint.pt"), out)
+    command("evaluate.py --sample-actions --save --distractors 2 --episodes 4", out)
     assert not os.path.exists(out / "zeroshot.csv")
     row, = read_csv(out / "zeroshot-sampled.csv")
-    episodes = evaluate.play(*train.load(str(out)), 0, range(2), True)
-    expected = np.mean([episode.success_aabb for episode in episodes])
-    assert row["success_aabb"] == pytest.approx(expected, abs=1e-4)
+    sampled, mean = (np.mean([episode.success_aabb for episode in evaluate.play(
+        *train.load(str(out)), 2, range(4), sample_actions)]) for sample_actions in (True, False))
+    assert row["success_aabb"] == pytest.approx(sampled, abs=1e-4)
+    assert abs(sampled - mean) > 0.01
+
+
+def test_ctrl_c_keeps_the_scores_of_runs_played_to_the_end(
+        trained, tmp_path, command, monkeypatch, capsys):
+    first, second = (shutil.copytree(trained, tmp_path / name) for name in ("first", "second"))
+    evaluate_run = evaluate.evaluate
+
+    def stopped_in_the_second(run, *rest):
+        if run == str(second):
+            raise KeyboardInterrupt
+        return evaluate_run(run, *rest)
+
+    monkeypatch.setattr(evaluate, "evaluate", stopped_in_the_second)
+    with pytest.raises(SystemExit) as end:
+        command("evaluate.py", first, second, "--distractors 0 --episodes 1 --save")
+    assert end.value.code == 130 and "stopped" in capsys.readouterr().err
+    assert len(read_csv(first / "zeroshot.csv")) == 1
+    assert not os.path.exists(second / "zeroshot.csv")
 
 
 def test_ranges_of_distractors():
@@ -3157,7 +3147,8 @@ def test_watching_plays_the_evaluated_episodes(simple, monkeypatch, capsys):
         assert render_mode == "human"
         return train.make_env(task, distractors, settings)
 
-    expected = slow_play(simple, 2, range(3), sample_actions=True)[:, 0]
+    simple["task"] = "lift"
+    expected = slow_play("lift", simple["settings"], 2, range(3), sample_actions=True)[:, 0]
     monkeypatch.setattr(evaluate, "make_env", make_env)
     evaluate.watch("simple", 2, 3, True)
     lines = capsys.readouterr().out.splitlines()[1:]
@@ -3176,14 +3167,15 @@ def test_film_shows_one_episode(simple, tmp_path, capsys):
         first = np.array(film.convert("RGB"), int)
         film.seek(7)
         assert np.abs(np.array(film.convert("RGB"), int) - first).max() > 50
-    rho, = slow_play(simple, 2, [0], sample_actions=False)[:, 0]
+    rho, = slow_play("push", simple["settings"], 2, [0], sample_actions=False)[:, 0]
     assert f"fractional success {rho:.2f}" in capsys.readouterr().out
 
 
-def test_a_film_from_the_command_line(trained, tmp_path, command):
+def test_a_film_from_the_command_line(trained, tmp_path, command, capsys):
     optional("PIL")
     before = files_below(trained)
-    command("evaluate.py", trained, "--gif", tmp_path / "a.gif", "--distractors 1")
+    command("evaluate.py", trained, "--gif", tmp_path / "a.gif")
+    assert "0 distractors" in capsys.readouterr().out          # as it was trained
     assert read(tmp_path / "a.gif")[:6] == b"GIF89a"
     assert files_below(trained) == before
 
@@ -3203,7 +3195,6 @@ SCRIPTS = {                              # script: (arguments, words that it pri
     "probe.py": (["RUN", "--distractors", "1"], ["named cube (mm)", "| lrn | 1 | "]),
     "screen.py": (["--steps", "1", "--episodes", "1", "--out", os.devnull],
                   ["| sum | 2 | 0 |", "| softmax | 9 | 1 |"]),
-    "search.py": ([], ["| push-first | 2.0e-03 | 0.36 | 0.0"]),
     "recheck.py": (["results/push-lrn-n2-seed2", "--episodes", "2"],
                    ["push-lrn-n2-seed2 | N = 2 | 0.", "push-lrn-n2-seed2 | N = 9 | 0."]),
 }
@@ -3212,7 +3203,7 @@ SCRIPTS = {                              # script: (arguments, words that it pri
 @pytest.fixture(scope="module")
 def scripts(trained):
     """All of SCRIPTS, started side by side."""
-    return {name: start(os.path.join("results", name),
+    return {name: start_process(os.path.join("results", name),
                         *(trained if word == "RUN" else word for word in arguments))
             for name, (arguments, _) in SCRIPTS.items()}
 
@@ -3243,10 +3234,9 @@ def results_scripts(monkeypatch):
 def test_reweighing_changes_nothing_at_the_n_of_training(kind, results_scripts):
     import reweigh
 
-    torch.manual_seed(0)
     agent = train.Agent(kind, 2, train.DEFAULTS)
     env = train.make_env("push", 2, train.DEFAULTS)
-    obs = evaluate.as_batch([env.reset(seed=seed)[0] for seed in range(4)])
+    obs = as_batch([env.reset(seed=seed)[0] for seed in range(4)])
     env.close()
     with torch.no_grad():
         torch.testing.assert_close(reweigh.reweighed_z(agent, obs), agent.encode(obs),
@@ -3366,7 +3356,6 @@ def test_a_probe_reads_what_z_holds_and_nothing_else(results_scripts):
     """z holds the first place, turned and stretched, and nothing of the second one."""
     import probe
 
-    torch.manual_seed(0)
     held, independent = torch.randn(2, 3000, 2)
     z = torch.cat([held @ torch.tensor([[3.0, 1.0], [-1.0, 2.0]]), torch.ones(3000, 1)], dim=1)
     guess = probe.guess_error(independent)
@@ -3378,7 +3367,6 @@ def test_a_probe_reads_what_z_holds_and_nothing_else(results_scripts):
 def test_a_probe_names_any_cube_of_the_middle_and_another_one_beside_it(results_scripts):
     import probe
 
-    torch.manual_seed(0)
     checkpoint = {"task": "push", "settings": train.DEFAULTS}
     states = probe.start_states(checkpoint, 3, 300)
     before = states["goal"].clone()
@@ -3456,19 +3444,16 @@ def test_every_table_stands_in_the_section_of_its_figure(results_scripts):
         assert figures.section_of(group) == "Figure 5", group
 
 
-def test_figures_are_drawn_and_tables_printed(tmp_path):
-    done = run("results/figures.py", "table")
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("| push-lrn-n2 | ") == 4       # one row in each of four tables
+def test_all_figures_are_drawn(tmp_path):
     done = run("results/figures.py", "9")
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     pytest.importorskip("matplotlib", reason="matplotlib is not installed (optional)")
-    done = run("results/figures.py", "--out", str(tmp_path))   # all that there are numbers for
+    done = run("results/figures.py", "--out", str(tmp_path))
     assert done.returncode == 0, done.stderr
-    for number in "378":
+    for number in "1345678":
         assert (tmp_path / f"figure{number}.png").read_bytes().startswith(b"\x89PNG")
     lines = done.stdout.splitlines()
-    assert len(lines) == 7 and all(line.startswith(("wrote ", "no figure ")) for line in lines)
+    assert len(lines) == 7 and all(line.startswith("wrote ") for line in lines)
 
 
 def table_rows(text):
@@ -3531,10 +3516,14 @@ def test_a_shipped_run_has_the_same_weights_and_no_optimiser(trained, tmp_path, 
         ship.ship(trained, str(tmp_path / "shipped"))
 
 
+def reproduce(*words, cwd=HERE):
+    return subprocess.run(["bash", "results/reproduce.sh", *words], cwd=cwd, capture_output=True,
+                          text=True)
+
+
 def test_every_shipped_run_has_its_command():
     """reproduce.sh names each run as train.py does, and knows which are done."""
-    done = subprocess.run(["bash", "results/reproduce.sh", "--list"], cwd=HERE,
-                          capture_output=True, text=True)
+    done = reproduce("--list")
     assert done.returncode == 0, done.stderr
     rows = [line.split() for line in done.stdout.splitlines()]
     names = [name for name, *_ in rows]
@@ -3554,10 +3543,6 @@ def test_every_shipped_run_has_its_command():
 
 
 def test_reproduce_lists_what_a_pattern_names_and_refuses_unknown_options():
-    def reproduce(*words):
-        return subprocess.run(["bash", "results/reproduce.sh", *words], cwd=HERE,
-                              capture_output=True, text=True)
-
     before, after = reproduce("--list", "lift-rn"), reproduce("lift-rn", "--list")
     assert before.stdout == after.stdout and before.stdout.count("\n") == 3
     for words in (["--help"], ["nosuch"], ["--list", "nosuch"], ["push", "lift"], ["--jobs"],
@@ -3574,8 +3559,7 @@ def test_reproduce_does_not_take_a_run_of_somebody_else_for_its_own(tmp_path):
     run_folder.mkdir(parents=True)
     (run_folder / "checkpoint.pt").touch()
     (run_folder / "progress.csv").write_text("update,frames\n1,4000\n")
-    done = subprocess.run(["bash", "results/reproduce.sh", "push-lrn-n2-seed0"], cwd=tmp_path,
-                          capture_output=True, text=True)
+    done = reproduce("push-lrn-n2-seed0", cwd=tmp_path)
     assert done.returncode != 0 and "not begun by this script" in done.stderr
     assert not (tmp_path / "runs" / "push-lrn-n2-seed0.log").exists()
 
@@ -3583,7 +3567,6 @@ def test_reproduce_does_not_take_a_run_of_somebody_else_for_its_own(tmp_path):
 def test_a_recentred_lrn_is_the_same_at_its_n_and_ignores_constant_distractors(results_scripts):
     import recentre
 
-    torch.manual_seed(0)
     agent = train.Agent("lrn", 2, train.DEFAULTS)
     encoder = agent.encoder
     torch.nn.init.normal_(encoder.g[5].bias)
@@ -3633,7 +3616,6 @@ def test_relations_are_told_apart_by_kind(results_scripts):
     """Fingers, target, distractors, whichever cube the target is."""
     import inside
 
-    torch.manual_seed(0)
     agent = train.Agent("lrn", 3, train.DEFAULTS)
     env = train.make_env("push", 3, train.DEFAULTS)
     observations, targets = [], []
@@ -3642,7 +3624,7 @@ def test_relations_are_told_apart_by_kind(results_scripts):
         targets.append(env.target)
     env.close()
     assert len(set(targets)) > 1
-    obs = evaluate.as_batch(observations)
+    obs = as_batch(observations)
     found = inside.relations_of(agent, obs)
     relations = agent.encoder.relations(*agent.tokens(obs))    # cubes, then fingers
     for b, target in enumerate(targets):
@@ -3665,19 +3647,19 @@ ALONE = ["lrn.py", "rn.py", "attn.py", "ppo.py", "trifinger_env.py"]
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory):
+def modules_alone(tmp_path_factory):
     """Each of ALONE, started in a folder that holds nothing else, all side by side."""
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1"}        # several fight over busy cores
     folders = {name: tmp_path_factory.mktemp("alone") for name in ALONE}
     for name, folder in folders.items():
         shutil.copy(os.path.join(HERE, name), folder)
-    return {name: (folder, start(name, cwd=folder, env=one_thread))
+    return {name: (folder, start_process(name, cwd=folder, env=one_thread))
             for name, folder in folders.items()}
 
 
 @pytest.mark.parametrize("name", ALONE)
-def test_module_works_alone_in_an_empty_folder(name, alone):
-    folder, process = alone[name]
+def test_module_works_alone_in_an_empty_folder(name, modules_alone):
+    folder, process = modules_alone[name]
     printed, errors = process.communicate(timeout=300)
     assert process.returncode == 0 and len(printed.splitlines()) >= 3, errors
     assert sorted(os.listdir(folder)) in ([name], ["__pycache__", name])
@@ -3921,14 +3903,14 @@ MUTATIONS = {
          "test_observation_is_table_1"),
         ("if qw < 0:", "if False:", "test_observation_is_table_1"),
         ("*dq[:3], -1.0, *a,", "*dq[:3], 0.0, *a,", "test_observation_is_table_1"),
-        (" * self._scale", "", "test_observation_is_scaled_by_fixed_numbers"),
+        (" * self._scale", "", "test_observation_is_table_1"),
         ("POSITION_SCALE = 0.2 ", "POSITION_SCALE = 0.3 ",
-         "test_observation_is_scaled_by_fixed_numbers"),
+         "test_observation_is_table_1"),
         ("[0.5] * 3 + [10] * 3 + [1]", "[10] * 3 + [0.5] * 3 + [1]",
-         "test_observation_is_scaled_by_fixed_numbers"),
+         "test_observation_is_table_1"),
         ("LINEAR, ANGULAR = slice(11, 14), slice(14, 17)",
          "ANGULAR, LINEAR = slice(11, 14), slice(14, 17)",
-         "test_names_of_columns_are_those_of_table_1"),
+         "test_columns_are_picked_out_by_their_names"),
         ("fingertips(self._joint_targets) if is_integrated", "self._moment.tips if is_integrated",
          "test_fingertips_are_seen_where_they_are_told_to_be_if_targets_stay"),
         ("is_integrated = self.action_mode == \"integrated\"", "is_integrated = True",
@@ -3941,12 +3923,15 @@ MUTATIONS = {
         ("low + (high - low) * (a + 1) / 2", "low + (high - low) * a",
          "test_actions_ask_for_the_angles_they_should"),
         ("return clip(targets, JOINT_LOW * 3, JOINT_HIGH * 3)", "return targets",
-         "test_actions_ask_for_the_angles_they_should"),
+         "test_joint_targets_stay_within_the_joints_limits"),
         ("return clip(numbers, (-1.0,) * 9, (1.0,) * 9)", "return numbers",
          "test_actions_beyond_their_range_count_as_its_ends"),
         # Reward
         ("(before.to_goal - now.to_goal)", "(now.to_goal - before.to_goal)",
-         "test_distance_term_pays_for_moving_towards_the_goal"),
+         "test_reward_terms_add_up_and_follow_their_formulas"),
+        ("before, self._moment = self._moment, self._measure()",
+         "before = self._measure()\n        self._moment = before",
+         "test_moments_of_consecutive_steps_follow_each_other"),
         ("weights[\"overlap\"] * now.rho", "weights[\"overlap\"] * before.rho",
          "test_reward_terms_add_up_and_follow_their_formulas"),
         ("BETA = 0.05 ", "BETA = 0.5 ",
@@ -4062,13 +4047,13 @@ MUTATIONS = {
         ("reward_weights=weights", "reward_weights=None",
          "test_every_setting_reaches_the_learner_and_its_environments"),
         ("setting.paper if args.paper else setting.default", "setting.default",
-         "test_paper_sets_the_numbers_that_the_paper_prints"),
+         "test_paper_sets_the_numbers_of_the_paper_and_of_its_sources"),
         ("if args.task == \"lift\" and not args.paper:", "if args.task == \"lift\":",
          "test_lifting_has_frames_schedule_and_noise_of_its_own"),
         ("\"lr_power\": 2.0, \"log_std\": -1.0}", "\"lr_power\": 2.0}",
          "test_lifting_has_frames_schedule_and_noise_of_its_own"),
         ("\"clip\": Setting(0.2, 0.5,", "\"clip\": Setting(0.2, 0.2,",
-         "test_paper_sets_the_numbers_that_the_paper_prints"),
+         "test_paper_sets_the_numbers_of_the_paper_and_of_its_sources"),
         ("        refuse_if_without_effect(name, args.encoder)\n", "",
          "test_bad_input_ends_with_one_line_and_status_2"),
         ("if value < 0 and not may_be_negative:", "if False:",
@@ -4171,16 +4156,39 @@ def test_every_planted_defect_has_its_place_and_its_test():
     assert len(set(EVERY_MUTATION)) == len(EVERY_MUTATION) > 150
 
 
-@pytest.mark.skipif(not SLOW, reason="takes an hour: SLOW=1")
+def copy_of_the_project(folder):
+    """All code copied; what was measured (results/) is linked."""
+    os.mkdir(folder / "results")
+    for part in ("", "results"):
+        for name in os.listdir(os.path.join(HERE, part)):
+            source, target = os.path.join(HERE, part, name), folder / part / name
+            if name.endswith(".py"):
+                shutil.copy(source, target)
+            elif part:
+                os.symlink(source, target)
+
+
+def run_one_test(test, folder):
+    quick = {key: value for key, value in os.environ.items() if key != "SLOW"}
+    return run("-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"test_all.py::{test}",
+               cwd=folder, env=quick, timeout=600)
+
+
+@pytest.fixture(scope="module")
+def passes_unbroken(tmp_path_factory):
+    """Does a test pass in a copy with no defect? Where it does not, a red one would say nothing."""
+    folder = tmp_path_factory.mktemp("unbroken")
+    copy_of_the_project(folder)
+    return functools.cache(lambda test: run_one_test(test, folder).returncode == 0)
+
+
+@pytest.mark.skipif(not SLOW, reason="takes hours: SLOW=1")
 @pytest.mark.parametrize("name, source, mutated, test", EVERY_MUTATION)
-def test_mutation_is_caught(name, source, mutated, test, tmp_path):
-    for file in os.listdir(HERE):
-        if file.endswith(".py"):
-            shutil.copy(os.path.join(HERE, file), tmp_path)
+def test_mutation_is_caught(name, source, mutated, test, tmp_path, passes_unbroken):
+    assert passes_unbroken(test)
+    copy_of_the_project(tmp_path)
     path = tmp_path / name
     path.write_text(path.read_text().replace(source, mutated))
-    quick = {key: value for key, value in os.environ.items() if key != "SLOW"}
-    done = run("-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"test_all.py::{test}",
-               cwd=tmp_path, env=quick, timeout=600)
+    done = run_one_test(test, tmp_path)
     # 1: tests ran and failed; another status would be that none was found, or pytest's own error.
     assert done.returncode == 1 and "1 failed" in done.stdout, done.stdout
