@@ -300,8 +300,7 @@ def joint(parent, child, place, axis, lower, upper):
 def finger_urdf():
     """URDF of one finger: masses and inertias of TriFingerEdu, the tip merged into the lower link.
 
-    Only the lower link can touch things. What is drawn reaches from joint to joint. Lines are kept
-    short because PyBullet breaks a line after 1023 characters, wherever that is.
+    Only the lower link can touch things. What is drawn reaches from joint to joint.
     """
     knee, tip = (0, -0.03745, -LINK), (0, -0.008, -LINK)       # the lower joint, the fingertip
     touching = (f'<collision>{origin((0, -0.008, -LINK / 2))}<geometry>'
