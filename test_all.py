@@ -2770,12 +2770,11 @@ def test_nothing_is_unpickled_or_downloaded():
     known = {"argparse", "copy", "csv", "datetime", "math", "multiprocessing", "os",
              "shutil", "signal", "socket", "sys", "tempfile", "time", "typing", "numpy", "torch",
              "pybullet", "gymnasium", "PIL", "lrn", "rn", "attn", "ppo", "train", "trifinger_env"}
-    of_results = {"cProfile", "evaluate", "figures", "glob", "grasp", "matplotlib", "re", "sklearn",
-                  "stable_baselines3"}
-    scripts = [os.path.join("results", name) for name in os.listdir(os.path.join(HERE, "results"))
-               if name.endswith(".py")]
-    for name in (*MODULES, *scripts):
-        if name in scripts:
+    scripts = [name for name in os.listdir(os.path.join(HERE, "results")) if name.endswith(".py")]
+    of_results = {"evaluate", "functools", "glob", "matplotlib", "re", "sklearn",
+                  "stable_baselines3", "subprocess", *(name[:-3] for name in scripts)}
+    for name in (*MODULES, *(os.path.join("results", name) for name in scripts)):
+        if name not in MODULES:
             known = known | of_results
         for node in ast.walk(ast.parse(read(os.path.join(HERE, name)))):
             modules = []
