@@ -20,7 +20,8 @@ a_run() {
 # The runs of all figures, those of the first seed first.
 all_runs() {
     paper_reward="reward_distance=250 reward_reach=0 reward_curiosity=10"
-    paper_world="action_mode=absolute cube_mass=0.02 finger_friction=0.1 goal_yaw=0.7854"
+    paper_cube="cube_mass=0.02 finger_friction=0.1"
+    paper_world="action_mode=absolute $paper_cube goal_yaw=0.7854"
     for seed in 0 1 2 3 4; do
         for encoder in lrn rn attn; do
             a_run push $encoder 2 $seed                        # figure 3, top
@@ -67,8 +68,8 @@ all_runs() {
                 $paper_reward
             a_run push lrn 2 $seed noreadout-paperworld --set auxiliary=0 $paper_world \
                 $paper_reward
-            a_run push lrn 2 $seed noreadout-slippery --set auxiliary=0 cube_mass=0.02 \
-                finger_friction=0.1 $paper_reward
+            a_run push lrn 2 $seed noreadout-slippery --set auxiliary=0 $paper_cube \
+                $paper_reward
             a_run push lrn 2 $seed noreadout-absolute --set auxiliary=0 action_mode=absolute \
                 $paper_reward
             a_run push lrn 2 $seed noreadout-curiosity --set auxiliary=0 reward_curiosity=10
@@ -82,8 +83,7 @@ all_runs() {
             a_run push lrn 2 $seed paperworld-std --set $paper_world $paper_reward log_std=0
             a_run push lrn 2 $seed paperworld-30s --set $paper_world $paper_reward \
                 substeps=3 timestep=0.004 episode_steps=2500 steps=2500 envs=2
-            a_run push lrn 2 $seed slippery --set cube_mass=0.02 finger_friction=0.1 \
-                $paper_reward
+            a_run push lrn 2 $seed slippery --set $paper_cube $paper_reward
             a_run push lrn 2 $seed paper --paper                # the printed recipe, 60 M frames
             a_run push lrn 2 $seed paper-values --paper --set normalize_values=True
             a_run push lrn 2 $seed paper-normalized --paper --set normalize_values=True \
