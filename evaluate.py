@@ -28,7 +28,8 @@ import pybullet
 import torch
 
 from train import STOPPED, checkpoint_file, cores, derived_seed, fail, load, make_env, positive
-from trifinger_env import CUBE, IDENTIFIER, IDENTIFIERS, POSITION, POSITION_SCALE, SOLVED, TIME
+from trifinger_env import (CUBE, DIVERGED, IDENTIFIER, IDENTIFIERS, POSITION, POSITION_SCALE,
+                           SOLVED, TIME)
 
 COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict",
            "solved", "cut_short", "blocked", "success_clear", "success_blocked", "z_drift",
@@ -358,7 +359,8 @@ def film(run, distractors, sample_actions, path):
     every = max(1, round(PICTURE / (env.substeps * env.timestep)))
     pictures = []
     for step, info in enumerate(play_live(agent, env, 0, sample_actions)):
-        if step % every == 0:
+        has_picture = info.get("truncated_by") != DIVERGED     # of that there is nothing to draw
+        if step % every == 0 and has_picture:
             pictures.append(Image.fromarray(env.render(320, 240)))
     env.close()
     pictures[0].save(path, save_all=True, append_images=pictures[1:],

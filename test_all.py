@@ -3169,6 +3169,27 @@ def test_film_shows_one_episode(simple, tmp_path, capsys):
     assert f"fractional success {rho:.2f}" in capsys.readouterr().out
 
 
+def test_a_film_ends_where_the_physics_diverge(simple, tmp_path, monkeypatch, capsys):
+    """Step 4 would have a picture, but there is no world left to draw."""
+    optional("PIL")
+    from PIL import Image
+    env = train.make_env("push", 2, simple["settings"], "rgb_array")
+    steps = itertools.count(1)
+    plain_step = env.step
+
+    def step(action):
+        if next(steps) == 4:
+            put(env, 1, (0, 0, 0.1), velocity=[float("nan")] * 3)
+        return plain_step(action)
+
+    monkeypatch.setattr(env, "step", step)
+    monkeypatch.setattr(evaluate, "make_env", lambda *_: env)
+    evaluate.film("simple", 2, False, str(tmp_path / "a.gif"))
+    with Image.open(tmp_path / "a.gif") as film:
+        assert film.n_frames == 2                              # of the start and of step 2
+    assert "wrote" in capsys.readouterr().out
+
+
 def test_a_film_from_the_command_line(trained, tmp_path, command, capsys):
     optional("PIL")
     before = files_below(trained)
@@ -4149,7 +4170,9 @@ MUTATIONS = {
          "test_watching_plays_the_evaluated_episodes"),
         ("noise_of([episode])", "noise_of([0])",
          "test_watching_plays_the_evaluated_episodes"),
-        ("if step % every == 0:", "if True:", "test_film_shows_one_episode"),
+        ("if step % every == 0 and has_picture:", "if has_picture:", "test_film_shows_one_episode"),
+        ("if step % every == 0 and has_picture:", "if step % every == 0:",
+         "test_a_film_ends_where_the_physics_diverge"),
     ),
 }
 EVERY_MUTATION = [(name, *mutation) for name, many in MUTATIONS.items() for mutation in many]

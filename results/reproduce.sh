@@ -54,6 +54,8 @@ all_runs() {
         if [ $seed -le 1 ]; then
             for N in 0 1 2; do                                 # MLP of figure 1
                 a_run push mlp $N $seed
+            done
+            for N in 1 2; do
                 a_run push mlp $N $seed long --frames 9000000
             done
             a_run push lrn-max 9 $seed                         # beyond the paper: 9 in training
