@@ -37,7 +37,7 @@ COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", 
 CHUNK = 25                               # episodes side by side; another number may change bits
 EVALUATION = 20220131                    # keeps these seeds apart from training's
 STARTS, NOISE = 0, 1                     # what an episode draws: see derived_seed()
-PICTURE = 0.08                           # s between two pictures of a film
+PICTURE_PERIOD = 0.08                    # s between two pictures of a film, about
 
 
 class Episode(NamedTuple):
@@ -175,9 +175,9 @@ def play(checkpoint, agent, distractors, episodes, sample_actions):
 
 def play_chunk(arguments):
     """play() in a process of its own, which has to load the agent anew."""
-    path, *task = arguments
+    path, *rest = arguments
     torch.set_num_threads(1)
-    return play(*load(path), *task)
+    return play(*load(path), *rest)
 
 
 # ---- the sweep over N
@@ -238,7 +238,7 @@ def evaluate(run, numbers, episodes, sample_actions=False):
     run that is still being trained replaces its own.
     """
     with tempfile.TemporaryDirectory() as folder:
-        shutil.copy(checkpoint_file(run), folder)
+        shutil.copy(checkpoint_file(run), os.path.join(folder, "checkpoint.pt"))
         checkpoint, _ = load(folder)
         numbers = playable(run, checkpoint, numbers)
         if not numbers:
@@ -262,13 +262,13 @@ def playable(run, checkpoint, numbers):
 def play_all(path, numbers, episodes, sample_actions):
     """Rows of the agent in `path`, chunk by chunk on all cores."""
     parts = chunks(episodes)
-    tasks = [(path, n, part, sample_actions) for n in numbers for part in parts]
+    jobs = [(path, n, part, sample_actions) for n in numbers for part in parts]
     context = multiprocessing.get_context("spawn")
     rows, begin = [], time.monotonic()
     # Ctrl-C is for the main process alone: leaving the pool ends the others.
-    with context.Pool(min(cores(), len(tasks)), initializer=signal.signal,
+    with context.Pool(min(cores(), len(jobs)), initializer=signal.signal,
                       initargs=(signal.SIGINT, signal.SIG_IGN)) as pool:
-        results = pool.imap(play_chunk, tasks)                 # in order, as they are done
+        results = pool.imap(play_chunk, jobs)                  # in order, as they are done
         for n in numbers:
             played = [episode for _ in parts for episode in next(results)]
             rows.append(summary(n, played))
@@ -356,7 +356,8 @@ def film(run, distractors, sample_actions, path):
         raise ValueError("--gif needs pillow: pip install pillow") from None
     checkpoint, agent = load(run)
     env = make_env(checkpoint["task"], distractors, checkpoint["settings"], "rgb_array")
-    every = max(1, round(PICTURE / (env.substeps * env.timestep)))
+    seconds = env.substeps * env.timestep                      # of an action
+    every = max(1, round(PICTURE_PERIOD / seconds))            # actions from picture to picture
     pictures = []
     for step, info in enumerate(play_live(agent, env, 0, sample_actions)):
         has_picture = info.get("truncated_by") != DIVERGED     # of that there is nothing to draw
@@ -364,7 +365,7 @@ def film(run, distractors, sample_actions, path):
             pictures.append(Image.fromarray(env.render(320, 240)))
     env.close()
     pictures[0].save(path, save_all=True, append_images=pictures[1:],
-                     duration=round(1000 * PICTURE), loop=0)
+                     duration=round(1000 * every * seconds), loop=0)
     print(f"wrote {path}: {distractors} distractors, fractional success "
           f"{info['fractional_success']:.2f}")
 

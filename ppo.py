@@ -200,7 +200,8 @@ class PPO(nn.Module):
                 ended = terminates or truncated
                 if ended or t == T - 1:
                     is_last[t, e] = True
-                    final_observations[t, e] = current[e]
+                    final_observations[t, e] = {key: np.array(value, np.float32)
+                                                for key, value in current[e].items()}
                 if ended:
                     episodes.append({"return": total[e], "length": int(length[e]), "info": info})
                     total[e] = length[e] = 0

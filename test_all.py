@@ -731,8 +731,10 @@ def test_overlap_against_hand_computed_cases():
             (((side, 0.0, z), STILL), 0.0, 0.0),
             (((0.0, 0.0, z), eighth), 1.0, 2 * (math.sqrt(2) - 1)),        # square's octagon
             (((0.01, 0.0, z), eighth), 1.0, None),             # lenient: still 1.0, 1 cm off
+            (((side / 2, side / 2, z), eighth), None, 0.25),   # two edges lie in a plane of goal's
             (((0.0, 0.0, z), turn((1, 0, 0), math.pi / 2)), 1.0, 1.0)):
-        assert tri.aabb_overlap(cube, goal) == pytest.approx(aabb, abs=1e-9)
+        if aabb is not None:
+            assert tri.aabb_overlap(cube, goal) == pytest.approx(aabb, abs=1e-9)
         if strict is not None:
             assert tri.oriented_overlap(cube, goal) == pytest.approx(strict, abs=1e-9)
 
@@ -1247,7 +1249,7 @@ def test_soak(n, task, kind):
     ({"distractors": 21}, "holds 21 cubes"),
     ({"reward_weights": {"joy": 1}}, "joy"),
     ({"episode_steps": 0}, "positive"),
-    ({"substeps": 0}, "positive"),
+    ({"substeps": 0}, "positive"), ({"substeps": 2.5}, "positive integers"),
     ({"timestep": 0.0}, "positive"),
     ({"action_mode": "torque"}, "action_mode"),
     ({"action_scale": 0.0}, "positive"),
@@ -1751,6 +1753,28 @@ def test_ppo_refuses_a_gradient_that_is_not_finite_and_keeps_the_weights():
     with pytest.raises(FloatingPointError):
         learner.update(1.0)
     assert all(torch.equal(p, q) for p, q in zip(before, learner.agent.parameters()))
+
+
+class Reusing(PointOnLine):
+    """Shows its observations in one array of float64, as an environment may."""
+    shown = None
+
+    def observation(self):
+        if self.shown is None:
+            self.shown = np.zeros(2)
+        self.shown[:] = super().observation()["x"]
+        return {"x": self.shown}
+
+
+def test_an_environment_may_reuse_its_array_of_any_type():
+    batches = []
+    for make in (PointOnLine, Reusing):
+        torch.manual_seed(0)
+        learner = PPO(TinyAgent(), [make(), make()], steps=32)
+        learner.rollout([1, 2])
+        batches.append(learner.batch)
+    for key, expected in batches[0].items():
+        assert torch.equal(batches[1][key], expected), key
 
 
 TWO_RANKS = """
@@ -2535,6 +2559,21 @@ def test_overwrite_starts_anew(tmp_path, command):
     assert train.load(str(again))[0]["seed"] == 1
 
 
+def test_scores_go_when_the_weights_they_are_of_are_replaced(tmp_path, command, monkeypatch):
+    """Somebody evaluates a run that is still being trained; evaluate.py --save keeps other N."""
+    out = tmp_path / "run"
+    write = train.Run.write
+
+    def write_and_evaluate(run, *rest):
+        write(run, *rest)
+        if run.update == 1:
+            (out / "zeroshot.csv").write_text("of these weights")
+
+    monkeypatch.setattr(train.Run, "write", write_and_evaluate)
+    command("train.py --ranks 1 --frames 600 --out", out, *SMALL)
+    assert len(read_csv(out / "progress.csv")) == 3 and not os.path.exists(out / "zeroshot.csv")
+
+
 def test_resuming_a_finished_run_changes_nothing(trained, tmp_path, command, capsys):
     out = tmp_path / "run"
     shutil.copytree(trained, out)
@@ -2568,6 +2607,15 @@ def test_torchrun_starts_the_same_file(tmp_path):
     assert checkpoint["frames"] == 400 and checkpoint["ranks"] == 2
 
 
+def test_variables_of_another_launcher_are_not_torchruns(tmp_path, command, monkeypatch):
+    """Clusters set them for every job: this run has one rank all the same, and is written down."""
+    for name, value in (("RANK", "1"), ("WORLD_SIZE", "2")):
+        monkeypatch.setenv(name, value)
+    assert train.read_command(["--ranks", "1"]).ranks == 1
+    command("train.py --ranks 1 --frames 200 --out", tmp_path / "run", *SMALL)
+    assert len(read_csv(tmp_path / "run" / "progress.csv")) == 1
+
+
 @needs_proc
 @pytest.mark.parametrize("victim", [0, 1])
 def test_a_killed_rank_ends_the_run_and_leaves_nobody_behind(victim, tmp_path):
@@ -2595,6 +2643,13 @@ def test_a_gradient_that_is_not_finite_ends_the_run_and_keeps_the_checkpoint(
         command("train.py --distractors 0 --resume --out", out)
     assert stop.value.code == 1 and "update 3" in capsys.readouterr().err
     assert read(out / "checkpoint.pt") == before
+
+
+def test_of_two_ranks_one_says_that_a_gradient_is_not_finite(tmp_path):
+    done = run("train.py", "--ranks", "2", "--out", str(tmp_path / "run"), *SMALL,
+               "reward_distance=1e300")
+    assert done.returncode == 1 and done.stderr.count("not finite") == 1, done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_a_checkpoint_that_lacks_a_setting_takes_the_default(trained, tmp_path, command):
@@ -3086,6 +3141,15 @@ def test_evaluation_leaves_a_run_as_it_is_unless_asked_to_save(trained, tmp_path
     assert set(files_below(out)) - set(before) == {str(out / "zeroshot.csv")}
 
 
+def test_a_checkpoint_of_any_name_can_be_evaluated(trained, tmp_path, command, capsys):
+    shutil.copy(os.path.join(trained, "checkpoint.pt"), tmp_path / "best.pt")
+    lines = []
+    for path in (trained, tmp_path / "best.pt"):
+        command("evaluate.py", path, "--episodes 2 --distractors 1")
+        lines.append(capsys.readouterr().out.splitlines()[-1])
+    assert lines[0] == lines[1] and lines[0].split()[0] == "1"
+
+
 def test_rows_are_saved_in_order_and_other_n_stay(tmp_path):
     path = str(tmp_path / "zeroshot.csv")
 
@@ -3154,16 +3218,19 @@ def test_watching_plays_the_evaluated_episodes(played_task, simple, monkeypatch,
     assert [line.split(":")[0] for line in lines] == ["episode 0", "episode 1", "episode 2"]
 
 
-def test_film_shows_one_episode(simple, tmp_path, capsys):
-    """15 steps at 25 Hz: pictures of the start and of every other step, 80 ms each."""
+@pytest.mark.parametrize("substeps, pictures, milliseconds", [(5, 8, 80), (20, 16, 160)])
+def test_film_shows_one_episode(substeps, pictures, milliseconds, simple, tmp_path, capsys):
+    """15 steps at 25 Hz: pictures of the start and of every other step; at 6.25 Hz of every one."""
     optional("PIL")
     from PIL import Image
     path = str(tmp_path / "a.gif")
+    simple["settings"]["substeps"] = substeps
     evaluate.film("simple", 2, False, path)
     with Image.open(path) as film:
-        assert film.n_frames == 8 and film.size == (320, 240) and film.info["duration"] == 80
+        assert film.n_frames == pictures and film.size == (320, 240)
+        assert film.info["duration"] == milliseconds
         first = np.array(film.convert("RGB"), int)
-        film.seek(7)
+        film.seek(pictures - 1)
         assert np.abs(np.array(film.convert("RGB"), int) - first).max() > 50
     rho, = slow_play("push", simple["settings"], 2, [0], sample_actions=False)[:, 0]
     assert f"fractional success {rho:.2f}" in capsys.readouterr().out
@@ -3831,6 +3898,8 @@ MUTATIONS = {
          "test_two_ranks_give_the_gradient_of_one_on_the_joined_batch"),
         ("moments = rank_mean(torch.stack([", "moments = (torch.stack([",
          "test_two_ranks_give_the_gradient_of_one_on_the_joined_batch"),
+        ("np.array(value, np.float32)", "value",
+         "test_an_environment_may_reuse_its_array_of_any_type"),
     ),
     "trifinger_env.py": (
         # The world
@@ -3985,6 +4054,11 @@ MUTATIONS = {
         # Pictures
         ("if i == self.target else", "if i == 0 else",
          "test_picture_shows_target_goal_and_distractors_in_their_colours"),
+        ("beyond_p <= 0 < beyond_q or beyond_q <= 0 < beyond_p",
+         "beyond_p < 0 < beyond_q or beyond_q < 0 < beyond_p",
+         "test_overlap_against_hand_computed_cases"),
+        ("not isinstance(count, (int, np.integer)) or count < 1", "count < 1",
+         "test_bad_arguments_are_refused"),
     ),
     "train.py": (
         # Files
@@ -4100,14 +4174,21 @@ MUTATIONS = {
          "test_stopped_killed_and_resumed_equals_never_stopped"),
         ("os.remove(self.path(name))", "pass",
          "test_stopped_killed_and_resumed_equals_never_stopped"),
-        ("        if self.update < self.last_update:", "        if True:",
-         "test_resuming_a_finished_run_changes_nothing"),
+        ("for name in (\"zeroshot.csv\", \"zeroshot-sampled.csv\"):", "for name in ():",
+         "test_scores_go_when_the_weights_they_are_of_are_replaced"),
         ("is_whole and int(row[0]) <= update", "is_whole",
          "test_resume_drops_rows_after_the_checkpoint_and_torn_lines"),
         ("{**DEFAULTS, **checkpoint[\"settings\"]}", "checkpoint[\"settings\"]",
          "test_a_checkpoint_that_lacks_a_setting_takes_the_default"),
         ("weights_only=True", "weights_only=False",
          "test_bad_input_ends_with_one_line_and_status_2"),
+        ("    return int(os.environ[\"RANK\"]) if ranks > 1 else 0",
+         "    return int(os.environ.get(\"RANK\", 0))",
+         "test_variables_of_another_launcher_are_not_torchruns"),
+        ("    if dist.is_torchelastic_launched():", "    if \"WORLD_SIZE\" in os.environ:",
+         "test_variables_of_another_launcher_are_not_torchruns"),
+        ("            sys.exit(1)", "            pass",
+         "test_of_two_ranks_one_says_that_a_gradient_is_not_finite"),
     ),
     "evaluate.py": (
         ("play_all(folder, numbers,", "play_all(run, numbers,",
@@ -4173,6 +4254,10 @@ MUTATIONS = {
         ("if step % every == 0 and has_picture:", "if has_picture:", "test_film_shows_one_episode"),
         ("if step % every == 0 and has_picture:", "if step % every == 0:",
          "test_a_film_ends_where_the_physics_diverge"),
+        ("os.path.join(folder, \"checkpoint.pt\"))", "folder)",
+         "test_a_checkpoint_of_any_name_can_be_evaluated"),
+        ("round(1000 * every * seconds)", "round(1000 * PICTURE_PERIOD)",
+         "test_film_shows_one_episode"),
     ),
 }
 EVERY_MUTATION = [(name, *mutation) for name, many in MUTATIONS.items() for mutation in many]

@@ -55,7 +55,7 @@ SETTINGS = {
     # The environment
     "episode_steps": Setting(125, 2500, "5 s, not 30 s (4.1): more episodes show more goals"),
     "substeps": Setting(5, 3, "25 Hz, not 83.3 (4.1, CW): held longer, noise moves more"),
-    "timestep": Setting(0.008, 0.004, "s; CW: 0.004; a step costs as much, and is sound (tested)"),
+    "timestep": Setting(0.008, 0.004, "s, of a physics step; CW: 0.004; 8 ms are sound (tested)"),
     "action_mode": Setting("integrated", "absolute", "targets that stay keep a grip; CW: absolute"),
     "action_scale": Setting(0.1, 0.1, "rad, largest step of an action"),
     "cube_mass": Setting(0.08, 0.02, "kg; CW's pushing and picking tasks: 0.02"),
@@ -69,9 +69,9 @@ SETTINGS = {
     "lr": Setting(2e-3, 2.5e-4, "A.2; ours takes fewer frames"),
     "lr_power": Setting(1.0, 1.0, "lr falls as (share of training left) ^ this; A.2: linearly"),
     "clip": Setting(0.2, 0.5, "A.2; ours as usual in PPO"),
-    "anneal_clip": Setting(False, True, "rlpyt anneals both"),
+    "anneal_clip": Setting(False, True, "rlpyt anneals the clip range as it does lr"),
     "epochs": Setting(3, 4, "A.2; ours: fewer cost less time"),
-    "minibatches": Setting(8, 40, "A.2; of 500 samples by default, of 3000 in the paper"),
+    "minibatches": Setting(8, 40, "A.2; of 500 samples here, of 3000 with CW's batch"),
     "discount": Setting(0.98, 0.98, "A.2; at 25 Hz it looks 2 s ahead, at 83.3 Hz 0.6 s"),
     "lam": Setting(0.95, 0.95, "A.2"),
     "entropy": Setting(0.001, 0.01, "A.2; with normalised advantages 0.01 lets std grow"),
@@ -163,7 +163,7 @@ class Agent(nn.Module):
     def __init__(self, encoder, distractors, settings):
         super().__init__()
         D, Z, hidden = settings["token_dim"], settings["z_dim"], settings["hidden"]
-        self.kind, self.distractors = encoder, distractors
+        self.kind, self.distractors = encoder, distractors     # kind: the name in ENCODERS
         if encoder != "mlp":
             self.cube = mlp(CUBE_WIDTH, hidden, D)
             self.finger = mlp(FINGER_WIDTH, hidden, D)
@@ -199,7 +199,7 @@ class Agent(nn.Module):
         A small head reads FACTS numbers from z: the target cube's position and velocity, the goal's
         position and the three fingertips; the loss is their mean squared error. A batch holds few
         episodes, so few answers to "which cube is meant?". Hence the question is asked anew: every
-        sample gets fresh identifiers, a random cube as target and the goal of another sample.
+        sample gets fresh identifiers, a random cube as target and a goal from the shuffled batch.
         """
         cubes, goal = obs["cubes"].clone(), obs["goal"]
         B, count = cubes.shape[:2]
@@ -348,6 +348,10 @@ class Run:
         }
 
     def save(self, checkpoint):
+        """Replace the run's checkpoint; scores of the weights before go with them."""
+        for name in ("zeroshot.csv", "zeroshot-sampled.csv"):
+            if os.path.exists(self.path(name)):
+                os.remove(self.path(name))
         save(checkpoint, self.path("checkpoint.pt"))
         self.saved_at = time.monotonic()
 
@@ -357,10 +361,6 @@ class Run:
             self.save(self.checkpoint())
         keep_rows(self.path("progress.csv"), PROGRESS, self.update)
         keep_rows(self.path("timing.csv"), TIMING, self.update)
-        if self.update < self.last_update:
-            for name in ("zeroshot.csv", "zeroshot-sampled.csv"):          # of weights that change
-                if os.path.exists(self.path(name)):
-                    os.remove(self.path(name))
 
     def is_due(self):
         """Is it time for a checkpoint?"""
@@ -400,7 +400,7 @@ def join_ranks(ranks):
     torch.set_num_threads(1)
     if ranks > 1:
         dist.init_process_group("gloo", timeout=timedelta(minutes=10))
-    return int(os.environ.get("RANK", 0))
+    return int(os.environ["RANK"]) if ranks > 1 else 0
 
 
 def leave_ranks(ranks, stopped):
@@ -479,7 +479,9 @@ def one_update(run, rank):
     rollout_seconds = time.monotonic() - begin
     try:
         stats = learner.update(left=1 - run.update / run.last_update)
-    except FloatingPointError as error:                        # on every rank alike
+    except FloatingPointError as error:                        # on every rank alike: one says so
+        if rank > 0:
+            sys.exit(1)
         fail(f"update {run.update + 1}: {error}; the last checkpoint stays as it was", status=1)
     sums = episode_sums(episodes)
     if dist.is_initialized():
@@ -500,7 +502,7 @@ def train(args, settings):
     A stop does not wait for the update under way, which can take minutes with --paper: it is given
     up, and the run is saved as it was before it.
     """
-    ranks = int(os.environ.get("WORLD_SIZE", 1))
+    ranks = args.ranks
     before = None
     try:
         rank = join_ranks(ranks)
@@ -517,7 +519,7 @@ def train(args, settings):
             before = copy.deepcopy(run.checkpoint())
     except KeyboardInterrupt:            # in rank 0 alone
         if before is None:
-            print("stopped before the first update")
+            print("stopped before any update of this call")
             leave_ranks(ranks, stopped=True)
         run.save(before)
     stopped = before["update"] < run.last_update
@@ -579,7 +581,7 @@ def read_command(argv=None):
         fail(f"--seed must be an integer from 0 to 2^32 - 1, got {args.seed}")
     if args.resume and args.overwrite:
         fail("--resume goes on with a run, --overwrite starts anew: give one of them")
-    if "WORLD_SIZE" in os.environ:       # started by torchrun
+    if dist.is_torchelastic_launched():                        # by torchrun
         args.ranks = int(os.environ["WORLD_SIZE"])
     return args
 
@@ -730,8 +732,7 @@ def start_rank(index, *arguments):
 
 def main():
     args, settings = parse()
-    started_by_torchrun = "RANK" in os.environ
-    if started_by_torchrun or args.ranks == 1:
+    if dist.is_torchelastic_launched() or args.ranks == 1:
         return train(args, settings)
     with socket.socket() as probe:       # a free port for the ranks to meet at
         probe.bind(("127.0.0.1", 0))
@@ -746,7 +747,7 @@ def main():
         train(args, settings)
     except RuntimeError as error:        # a rank that is gone breaks the others' connections
         try:
-            others.join()
+            others.join(timeout=10)      # not for ever: the error may be rank 0's own
         except mp.ProcessExitedException as exited:            # killed from outside
             fail(f"{exited}, so the run ends here; --resume goes on from the last checkpoint",
                  status=1)

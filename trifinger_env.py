@@ -60,8 +60,8 @@ FINGER_SIN_COS = [(math.sin(yaw), math.cos(yaw)) for yaw in FINGER_YAW]
 
 # Table 1: columns of an observation's rows, for readers and for whoever picks some out. The
 # identifier comes last in cubes and goal. In action_mode "integrated" a fingertip is shown where
-# the joint targets would hold it: targets are a state of their own then, and where the fingertip
-# really is follows from the joints' angles anyway.
+# the joint targets would hold it: the agent has to see those targets somewhere, and where the
+# fingertip really is follows from the joints' angles anyway.
 SIZE, POSITION, QUATERNION = slice(1, 4), slice(4, 7), slice(7, 11)        # of a cube and the goal
 LINEAR, ANGULAR = slice(11, 14), slice(14, 17)                             # of a cube
 IDENTIFIER = -1                                                            # of a cube and the goal
@@ -200,7 +200,7 @@ def cut(faces, axis, sign):
             beyond_q = sign * q[axis] - CUBE / 2
             if beyond_p <= 0:
                 inside.append(p)
-            if beyond_p < 0 < beyond_q or beyond_q < 0 < beyond_p:
+            if beyond_p <= 0 < beyond_q or beyond_q <= 0 < beyond_p:
                 crossing = p + (q - p) * beyond_p / (beyond_p - beyond_q)
                 inside.append(crossing)
                 cap.append(crossing)
@@ -229,8 +229,8 @@ def volume(faces):
 def squares_overlap(a, b):
     """(n, m) bool: does square i of a (n, 4) touch square j of b (m, 4)?
 
-    Rows are x, y, yaw, half edge. Two squares are apart if the projections on one of their edges'
-    directions are (separating axes).
+    Rows are x, y, yaw, half edge. Two squares are apart if, along the direction of
+    some edge of either, their projections do not meet (separating axes).
     """
     a, b = np.asarray(a)[:, None], np.asarray(b)[None]         # (n, 1, 4), (1, m, 4)
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
@@ -341,8 +341,8 @@ class TriFingerEnv(Env):
     substeps, timestep   physics steps per action and their length in s: the control rate is
                     1 / (substeps * timestep), 25 Hz by default. The paper's 83.3 Hz and 30 s:
                     episode_steps=2500, substeps=3, timestep=0.004.
-    action_mode     "integrated": joint target = last target + action_scale * action, but at most
-                    LEAD away from the measured angle, so that a zero action keeps a grip;
+    action_mode     "integrated": joint target = last target + action_scale * action, so that a zero
+                    action keeps a grip; at most LEAD away from the measured angle;
                     "delta": joint target = measured angle + action_scale * action;
                     "absolute": the action spans the joint range.
     action_scale    largest step of a joint target, rad; without effect on "absolute"
@@ -365,8 +365,9 @@ class TriFingerEnv(Env):
                  timestep=0.008, action_mode="integrated", action_scale=0.1, cube_mass=0.08,
                  finger_friction=1.0, goal_yaw=0.0, reward_weights=None, render_mode=None):
         check_arguments(task, distractors, action_mode, reward_weights, render_mode)
-        if episode_steps < 1 or substeps < 1:
-            raise ValueError("episode_steps and substeps must be positive integers")
+        for count in (episode_steps, substeps):
+            if not isinstance(count, (int, np.integer)) or count < 1:
+                raise ValueError("episode_steps and substeps must be positive integers")
         check_positive(timestep=timestep, action_scale=action_scale, cube_mass=cube_mass,
                        finger_friction=finger_friction)
         self.task, self.distractors = task, int(distractors)
@@ -585,7 +586,8 @@ class TriFingerEnv(Env):
         """Apply action (9,) in [-1, 1] (beyond: clipped).
 
         Returns (observation, reward, terminated, truncated, info). ValueError for an action that
-        is not nine finite numbers; RuntimeError before the first reset.
+        is not nine finite numbers; RuntimeError if reset() has to come first: at the beginning, and
+        after the physics diverged.
         """
         if self._steps is None:
             raise RuntimeError("call reset() before step()")
@@ -731,7 +733,7 @@ class TriFingerEnv(Env):
     def render(self, width=480, height=360):
         """RGB picture (height, width, 3) uint8 of the arena, drawn on the CPU; needs no screen.
 
-        RuntimeError without a render_mode or before the first reset.
+        RuntimeError without a render_mode, or if reset() has to come first.
         """
         if self._steps is None or not self.render_mode:
             raise RuntimeError("render() needs render_mode='rgb_array' and a reset() first")
