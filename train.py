@@ -390,6 +390,9 @@ class Run:
 
 
 # ---- training
+#
+# Rank 0 is the process that the user started. It alone writes files, prints, and catches Ctrl-C and
+# SIGTERM; the other ranks ignore Ctrl-C, and rank 0 ends them.
 
 STOPPED = 130                            # exit status after a Ctrl-C, as shells have it
 NOISE_STREAM = 10 ** 6                   # stream e < 10^6: environment e; 10^6 + r: torch on rank r

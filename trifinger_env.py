@@ -191,7 +191,11 @@ def cube_faces(centre, axes):
 
 
 def cut(faces, axis, sign):
-    """What is left of a convex body inside the goal's plane sign * x[axis] = CUBE / 2."""
+    """What is left of a convex body inside the goal's plane sign * x[axis] = CUBE / 2.
+
+    Points on the plane count as inside. `cap` gathers the points where edges cross the plane: they
+    are the corners of the new face that closes the body again.
+    """
     kept, cap = [], []
     for face in faces:
         inside = []
@@ -206,7 +210,7 @@ def cut(faces, axis, sign):
                 cap.append(crossing)
         if len(inside) > 2:
             kept.append(inside)
-    if len(cap) > 2:                                           # close the cut with a face
+    if len(cap) > 2:                                           # in order round their middle
         spokes = np.array(cap) - np.mean(cap, axis=0)
         angles = np.arctan2(spokes[:, axis - 1], spokes[:, axis - 2])      # the two other axes
         kept.append([cap[j] for j in np.argsort(angles)])
