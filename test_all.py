@@ -3276,9 +3276,9 @@ SCRIPTS = {                              # script: (arguments, words that it pri
     "profile_training.py": (["--updates", "1"], ["ms a frame", "bare physics", "update"]),
     "encoder_speed.py": (["--repeats", "1"], ["LRN: K=12", "RN: K=12", "slope"]),
     "grasp.py": (["--tries", "1"], ["0.08 kg | 0.00"]),
-    "scripted_lift.py": (["--episodes", "2"], ["0.00 to 0.20 m | 2 | 1.00"]),
+    "scripted_lift.py": (["--episodes", "2"], ["all | 2 | 1.00"]),
     "phases.py": (["RUN", "--distractors", "1", "--episodes", "2"],
-                  ["lrn | 1 | 0.00 to 0.20 m | 2"]),
+                  ["lrn | 1 | all | 2"]),
     "thrown.py": (["RUN", "--distractors", "1", "--episodes", "2"], ["far out", "| lrn | 0."]),
     "probe.py": (["RUN", "--distractors", "1"], ["named cube (mm)", "| lrn | 1 | "]),
     "screen.py": (["--steps", "1", "--episodes", "1", "--out", os.devnull],
@@ -3391,7 +3391,23 @@ def test_table_puts_seeds_together(tmp_path, results_scripts):
     two = figures.table(lrn[:2], "success_aabb")
     assert two[2] == "| push-lrn-n2 | 0.80<br>0.90, 0.70 |"
     assert solved[0].startswith("| solved |")
-    assert solved[3].endswith("| 0.50 ± 0.10 |")               # 1.96 * sqrt(0.5 * 0.5 / 100)
+    assert solved[3].endswith("| 0.50 ± 0.10 |")               # 1.96 sqrt(0.5 * 0.5 / 104)
+    never = write_run(tmp_path / "push-mlp-n1-seed0", 0.0, 30)
+    assert figures.table([never], "solved")[2].endswith("| 0.00 ± 0.03 |")       # p = 2 / 104
+
+    with open(os.path.join(lrn[0], "zeroshot.csv"), "a") as file:        # one of three was played
+        file.write(",".join(["9"] + ["0.0"] * (len(evaluate.COLUMNS) - 1)) + "\n")
+    assert figures.table(lrn, "success_aabb") == [line for line in aligned if "mlp" not in line]
+    assert figures.table(lrn[:1], "success_aabb")[0] == "| axis-aligned | N = 2 | N = 9 |"
+
+
+def test_a_curve_of_a_short_run_is_its_mean(results_scripts):
+    import figures
+
+    rows = {"update": np.arange(1.0, 5.0), "frames": 4000 * np.arange(1.0, 5.0),
+            "score": np.array([0.0, 0.2, 0.4, 0.6])}
+    frames, means = figures.smooth(rows, "score", window=25)
+    assert frames.tolist() == [0.016] and means == pytest.approx([0.3])
 
 
 def test_screened_encoders_pool_as_their_formulas_say(results_scripts):

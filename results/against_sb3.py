@@ -9,7 +9,6 @@ read-out is off (auxiliary=0), as SB3 has none. The first update of each warms u
 counted.
 """
 import argparse
-import csv
 import functools
 import os
 import subprocess
@@ -21,6 +20,7 @@ import torch
 
 PARENT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 sys.path.insert(0, PARENT)
+from figures import read
 from train import DEFAULTS, Agent, fail, make_env, positive
 
 try:
@@ -72,13 +72,13 @@ def speed_of_this(updates, envs):
                         "--frames", str((updates + 1) * batch), "--out", folder,
                         "--set", "auxiliary=0", f"envs={envs}"],
                        check=True, stdout=subprocess.DEVNULL)
-        with open(os.path.join(folder, "timing.csv"), newline="") as file:
-            seconds = [float(row["seconds"]) for row in csv.DictReader(file)]
+        seconds = read(folder, "timing.csv")["seconds"]
     return updates * batch / (seconds[-1] - seconds[0])
 
 
 def main():
     parser = argparse.ArgumentParser(description="Frames a second against Stable-Baselines3.")
+    parser.error = fail
     parser.add_argument("--updates", type=positive, default=4, metavar="U")
     parser.add_argument("--envs", type=positive, default=DEFAULTS["envs"], metavar="E")
     args = parser.parse_args()

@@ -17,7 +17,7 @@ import torch
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from lrn import LRN
 from rn import RN
-from train import positive
+from train import fail, positive
 
 B, D = 64, 64
 
@@ -36,6 +36,7 @@ def milliseconds(encoder, K, repeats):
 
 def main():
     parser = argparse.ArgumentParser(description="How the encoders' time grows with K.")
+    parser.error = fail
     parser.add_argument("--repeats", type=positive, default=25, metavar="R")
     args = parser.parse_args()
     torch.set_num_threads(1)

@@ -24,7 +24,8 @@ MEASURES = {                             # column of zeroshot.csv -> title of it
     "solved": "solved",
 }
 # Student's t for a 95 % interval, by the number of seeds
-STUDENT = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776}
+STUDENT = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776, 6: 2.571, 7: 2.447, 8: 2.365, 9: 2.306,
+           10: 2.262}
 TASKS = {"push": "PushingCube", "lift": "LiftingCube"}
 BLUE, RED, GREEN, YELLOW = "#0072B2", "#CC3311", "#009E73", "#AA8800"
 ENCODERS = {                             # of figures 3, 4 and 6 -> label, colour
@@ -134,8 +135,11 @@ def bar_of(rows, i, measure):
         return rows["ci95"][i]
     if measure == "success_strict":
         return rows["ci95_strict"][i]
-    share = rows["solved"][i]            # of a share p: 1.96 sqrt(p (1 - p) / n)
-    return 1.96 * np.sqrt(share * (1 - share) / rows["episodes"][i])
+    # Of a share (Agresti and Coull): as if two more episodes were solved and two were not.
+    # 1.96 sqrt(p (1 - p) / n) alone would call 0 of 200 certain.
+    episodes = rows["episodes"][i] + 4
+    share = (rows["solved"][i] * rows["episodes"][i] + 2) / episodes
+    return 1.96 * np.sqrt(share * (1 - share) / episodes)
 
 
 def cell(values, bars):
@@ -147,14 +151,15 @@ def cell(values, bars):
 
 
 def over_seeds(runs, measure):
-    """{N: Cell} of a measure over runs that differ in the seed alone."""
+    """{N: Cell} of a measure over runs that differ in the seed alone, where all were played."""
     values, bars = {}, {}
     for run in runs:
         rows = read(run, "zeroshot.csv")
         for i, n in enumerate(rows["distractors"].astype(int).tolist()):
             values.setdefault(n, []).append(rows[measure][i])
             bars.setdefault(n, []).append(bar_of(rows, i, measure))
-    return {n: cell(values[n], bars[n]) for n in sorted(values)}
+    of_all = [n for n in sorted(values) if len(values[n]) == len(runs)]
+    return {n: cell(values[n], bars[n]) for n in of_all}
 
 
 # ---- tables
@@ -259,7 +264,8 @@ def smooth(rows, name, window=WINDOW):
 
     A row may stand for several updates (ship.py).
     """
-    count = max(round(window * len(rows["update"]) / rows["update"][-1]), 1)
+    rows_a_window = round(window * len(rows["update"]) / rows["update"][-1])
+    count = min(max(rows_a_window, 1), len(rows["update"]))    # a run may be shorter than that
     means = np.convolve(rows[name], np.ones(count) / count, "valid")
     return rows["frames"][count - 1:] / 1e6, means
 
@@ -405,6 +411,7 @@ def figure_6(folder):
     for encoder, panel in zip(PAPER, axes.flat):
         label, color = ENCODERS[encoder]
         of_it = [row for row in dots if row["encoder"] == encoder]
+        np.random.default_rng(0).shuffle(of_it)                # in order N = 9 would hide the rest
         places = np.array([[row["x"], row["y"]] for row in of_it], float).reshape(-1, 2)
         numbers = [int(row["distractors"]) for row in of_it]
         points = panel.scatter(*places.T, s=2, c=numbers, cmap="viridis", vmin=0, vmax=9)

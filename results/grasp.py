@@ -16,7 +16,7 @@ import numpy as np
 import pybullet as pb
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-from train import positive
+from train import fail, positive
 from trifinger_env import (CUBE, FINGER_YAW, JOINT_LOW, JOINT_HIGH, TriFingerEnv,
                            inverse_kinematics, yaw_quaternion)
 
@@ -75,6 +75,7 @@ def share_held(mass, friction, tries):
 
 def main():
     parser = argparse.ArgumentParser(description="Scripted grasps by mass and friction.")
+    parser.error = fail
     parser.add_argument("--tries", type=positive, default=60, metavar="T",
                         help="per cell (default 60)")
     tries = parser.parse_args().tries

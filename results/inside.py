@@ -90,13 +90,13 @@ def some(points, count):
     return points[rows]
 
 
-def plane(points):
-    """(n, 2): t-SNE of points (n, Z)."""
+def tsne():
+    """scikit-learn's t-SNE into the plane; asked for before anything is played."""
     try:
         from sklearn.manifold import TSNE
     except ImportError:
         raise ValueError("figures 6 and 7 need scikit-learn: pip install scikit-learn") from None
-    return TSNE(random_state=0).fit_transform(points)
+    return TSNE(random_state=0)
 
 
 def moments(steps):
@@ -109,6 +109,7 @@ def moments(steps):
 
 def figure_6(episodes):
     """z by N, encoder by encoder."""
+    embedding = tsne()
     dots, drifts = [], []
     for encoder in PAPER:
         run = os.path.join(HERE, f"push-{encoder}-n2-seed0")
@@ -120,7 +121,7 @@ def figure_6(episodes):
         whole = {N: some(z.reshape(-1, z.shape[-1]), POINTS) for N, z in steps.items()}
         drifts += [(encoder, N, f"{energy_distance(whole[N], whole[2]):.4f}") for N in numbers]
         sample = {N: some(moments(z), POINTS // len(numbers)) for N, z in steps.items()}
-        places = plane(np.concatenate(list(sample.values())))
+        places = embedding.fit_transform(np.concatenate(list(sample.values())))
         labels = [N for N in numbers for _ in sample[N]]
         dots += [(encoder, N, f"{x:.2f}", f"{y:.2f}") for N, (x, y) in zip(labels, places)]
     write("figure6.csv", ("encoder", "distractors", "x", "y"), dots)
@@ -129,14 +130,16 @@ def figure_6(episodes):
 
 def figure_7(episodes):
     """LRN's relations by kind, in the plane."""
+    embedding = tsne()
     run = os.path.join(HERE, "push-lrn-n2-seed0")
     rows, kinds = [], []
     for N in range(3, 7):
         r = moments(record(run, N, episodes, relations_of))    # (n, K, D)
         r = some(r, POINTS // (4 * r.shape[1]))
         rows += list(r.reshape(-1, r.shape[-1]))
-        kinds += [*KINDS, *["distractors"] * (N - 1)] * len(r)             # KINDS has one of N
-    places = plane(np.array(rows))
+        of_one_state = [*KINDS, *["distractors"] * (N - 1)]    # KINDS ends with the first of N
+        kinds += of_one_state * len(r)
+    places = embedding.fit_transform(np.array(rows))
     write("figure7.csv", ("kind", "x", "y"),
           [(kind, f"{x:.2f}", f"{y:.2f}") for kind, (x, y) in zip(kinds, places)])
 
@@ -161,7 +164,7 @@ def write(name, columns, rows):
     print(f"wrote {path}")
 
 
-FIGURES = {"6": figure_6, "7": figure_7, "8": figure_8}
+FIGURES = {"8": figure_8, "6": figure_6, "7": figure_7}        # 8 needs no scikit-learn
 
 
 def main():

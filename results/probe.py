@@ -10,8 +10,9 @@ arena, where targets are drawn: one of these is named at random, another is the 
 nothing but the name tells the two apart, and a z that does not use it serves both equally.
 
 Prints mean distances in mm, also that of the read-out that was trained with the agent, if there
-was one, in the same states. (Only "as large as for the named cube" means something for the other
-cube: which of the rest is meant cannot be seen in a z that does not know the order of cubes.)
+was one, in the same states. (A z that does not know the order of the cubes cannot say which of the
+others is meant. So the other cube's error stays high in any case; what tells is whether that of the
+named cube is lower.)
 """
 import argparse
 import math

@@ -17,7 +17,7 @@ import torch
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from ppo import PPO
-from train import make_learner, positive, read_command, read_settings
+from train import fail, make_learner, positive, read_command, read_settings
 from trifinger_env import TriFingerEnv
 
 spent = {}                               # name of a function -> seconds spent in it
@@ -39,9 +39,9 @@ def put_clock_on(owner, name):
 
 
 def train(updates, learner):
-    """Train for `updates` updates: seconds by function in `spent`; one more, before, warms up.
+    """Play and learn `updates` times, after once more to warm up. Returns the frames of those.
 
-    Returns the frames played in them.
+    `spent` then holds the seconds by function.
     """
     E = len(learner.envs)
     for update in range(updates + 1):
@@ -56,6 +56,7 @@ def train(updates, learner):
 
 def main():
     parser = argparse.ArgumentParser(description="Where the time of training goes.")
+    parser.error = fail
     parser.add_argument("--updates", type=positive, default=10, metavar="U")
     parser.add_argument("--paper", action="store_true", help="the paper's settings")
     args = parser.parse_args()

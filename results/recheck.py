@@ -49,13 +49,16 @@ def compare(run, distractors, episodes):
 def main():
     parser = argparse.ArgumentParser(
         description="Play shipped agents in other episodes (see the first lines of recheck.py).")
+    parser.error = fail
     parser.add_argument("runs", nargs="*", metavar="RUN", help="default: five of the shipped ones")
     parser.add_argument("--episodes", type=positive, default=200, metavar="E", help="default 200")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    shipped = np.random.default_rng(SEED).permutation(shipped_runs())
     print("run | N | in zeroshot.csv | in other episodes | difference / its interval")
     try:
+        able = [run for run in shipped_runs()                  # an MLP plays its own N alone
+                if set(NUMBERS) <= set(read(run, "zeroshot.csv")["distractors"])]
+        shipped = np.random.default_rng(SEED).permutation(able)
         for run in args.runs or shipped[:5]:
             for distractors in NUMBERS:
                 compare(run, distractors, args.episodes)

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Train and evaluate the runs behind the figures and tables of this folder.
+# Train and evaluate the runs behind the figures and tables of this folder (but
+# unfinished/push-lrn-n2-paper-seed1 and the untrained agents: see probe.txt and thrown.txt).
 #
 #   results/reproduce.sh --list              every run and how far it is
 #   results/reproduce.sh                     whatever is left, one run after the other

@@ -16,7 +16,7 @@ import torch
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import evaluate
-from train import fail, load, make_env, positive
+from train import fail, load, positive
 from trifinger_env import IDENTIFIERS
 
 
@@ -55,12 +55,12 @@ def reweighed_z(agent, obs):
     if agent.kind == "rn":
         weights = pair_weights(is_distractor, T, N).flatten(1)             # (B, pairs)
         terms = encoder.relations(objects, goal).flatten(1, 2)             # (B, pairs, D)
-    else:
-        weights = token_weights(is_distractor, T, N)                       # (B, tokens)
-        if agent.kind == "attn":
-            terms, _ = encoder.attend(objects, goal)                       # (B, tokens, D)
-        else:                                                  # LRN: the goal is no term
-            terms, weights = encoder.relations(objects, goal), weights[:, :-1]
+    elif agent.kind == "attn":
+        weights = token_weights(is_distractor, T, N)                       # (B, K+1)
+        terms, _ = encoder.attend(objects, goal)                           # (B, K+1, D)
+    else:                                                      # LRN: the goal is no term
+        weights = token_weights(is_distractor[:, :-1], T, N)               # (B, K)
+        terms = encoder.relations(objects, goal)                           # (B, K, D)
     total = (weights[..., None] * terms).sum(1)                # (B, D)
     return encoder.norm(encoder.f(total))
 
@@ -76,9 +76,10 @@ def print_score(name, checkpoint, agent, N, episodes):
 @torch.inference_mode()
 def print_lengths(checkpoint, agent, N, episodes):
     """What each object adds to f's output of an LRN agent at the start of episodes."""
-    env = make_env(checkpoint["task"], N, checkpoint["settings"])
-    obs = evaluate.as_batch([env.reset(seed=evaluate.episode_seed(e))[0] for e in range(episodes)])
-    env.close()
+    envs, observations = evaluate.start(checkpoint, N, range(episodes))
+    for env in envs:
+        env.close()
+    obs = evaluate.as_batch(observations)
     r = agent.encoder.relations(*agent.tokens(obs))            # (B, K, D)
     added = r @ agent.encoder.f.weight.T                       # (B, K, Z)
     cubes, fingers = added[:, :N + 1], added[:, N + 1:]
@@ -93,6 +94,7 @@ def print_lengths(checkpoint, agent, N, episodes):
 def main():
     parser = argparse.ArgumentParser(
         description="Weigh distractors as in training (see the first lines of reweigh.py).")
+    parser.error = fail
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder of LRN, RN or ATTN")
     parser.add_argument("--distractors", type=int, choices=range(len(IDENTIFIERS)), metavar="N",
                         help="N (default 9; for a run trained at 9: 2)")

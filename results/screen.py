@@ -30,7 +30,7 @@ from torch import nn
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from evaluate import as_batch, read_errors
 from lrn import LRN, LRNMax, orthogonal
-from train import DEFAULTS, Agent, make_env, positive
+from train import DEFAULTS, Agent, fail, make_env, positive
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 TRAINED = (2, 9)                         # N
@@ -125,12 +125,15 @@ def millimetres(agent, observations):
 def main():
     parser = argparse.ArgumentParser(
         description="Compare ways to pool relations (see the first lines of screen.py).")
+    parser.error = fail
     parser.add_argument("--steps", type=positive, default=3000, metavar="S", help="default 3000")
     parser.add_argument("--episodes", type=positive, default=200, metavar="E",
                         help="of random play to learn from; a fifth to measure (default 200)")
     parser.add_argument("--out", default=os.path.join(HERE, "screen.csv"), metavar="FILE",
                         help="default results/screen.csv")
     args = parser.parse_args()
+    if not os.path.isdir(os.path.dirname(args.out) or "."):
+        fail(f"--out {args.out}: there is no such folder")
     torch.set_num_threads(1)
     tests = {n: states(n, max(1, args.episodes // 5), OTHERS) for n in NUMBERS}
     print("| read error (mm) | trained at | seed | " + " | ".join(map(str, NUMBERS)) + " |")

@@ -15,7 +15,7 @@ import numpy as np
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 from grasp import joint_angles
-from train import positive
+from train import fail, positive
 from trifinger_env import CUBE, JOINT_LOW, SOLVED, JOINT_HIGH, TriFingerEnv
 
 AROUND, PRESSED = 0.08, CUBE / 2 - 0.02                        # tips' distance from the middle, m
@@ -64,14 +64,20 @@ def play(env, seed):
 
 
 def bands(heights):
-    """[(label, which of the heights lie in it)] of every band that is not empty, and of all."""
+    """[(label, which of the heights lie in it)] of every band that is not empty, and of all.
+
+    Goals on the floor are all in one band: then of all alone.
+    """
     found = [(f"{low:.2f} to {high:.2f} m", (low < heights) & (heights <= high))
-             for low, high in (*BANDS, (0.0, 0.2))]
-    return [(label, at) for label, at in found if at.any()]
+             for low, high in BANDS]
+    found = [(label, at) for label, at in found if at.any()]
+    everything = [("all", np.ones(len(heights), bool))]
+    return found + everything if len(found) > 1 else everything
 
 
 def main():
     parser = argparse.ArgumentParser(description="LiftingCube by inverse kinematics.")
+    parser.error = fail
     parser.add_argument("--episodes", type=positive, default=200, metavar="E", help="default 200")
     episodes = parser.parse_args().episodes
     env = TriFingerEnv("lift", 0)

@@ -2,13 +2,15 @@
 
     python results/search.py
 
-"lr" and "std" are the learning rate and the deviation of actions at the start. The other cells are
-means of the 25 updates (100 000 frames) up to that point, axis-aligned, sampled actions, at N = 2;
-empty if the run had been stopped before.
+"lr" and "std" are the learning rate and the deviation of actions in the file's first row, after the
+first update or the first few: 0.50 at the start may show as 0.49. The other cells are means over
+the rows of the 100 000 frames up to that point (about 25 updates), axis-aligned, sampled actions,
+at N = 2; empty if the run had been stopped before.
 """
-import csv
 import glob
 import os
+
+from figures import read
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 POINTS = (0.3, 1.0, 1.6, 2.0, 3.0, 5.0)                        # million frames
@@ -17,11 +19,10 @@ WINDOW = 100_000                                               # frames
 
 def success_at(rows, frames):
     """Mean success of the WINDOW before `frames` as text; empty if the run is not so long."""
-    if int(rows[-1]["frames"]) < frames:
+    if rows["frames"][-1] < frames:
         return ""
-    values = [float(row["success_aabb"]) for row in rows
-              if frames - WINDOW < int(row["frames"]) <= frames]
-    return f"{sum(values) / len(values):.2f}"
+    in_window = (frames - WINDOW < rows["frames"]) & (rows["frames"] <= frames)
+    return f"{rows['success_aabb'][in_window].mean():.2f}"
 
 
 def main():
@@ -29,12 +30,11 @@ def main():
     print("|---" * (3 + len(POINTS)) + "|")
     frames = []
     for path in sorted(glob.glob(os.path.join(HERE, "search", "*.csv"))):
-        with open(path, newline="") as file:
-            rows = list(csv.DictReader(file))
-        start = f"{float(rows[0]['lr']):.1e}", f"{float(rows[0]['std']):.2f}"
+        rows = read(*os.path.split(path))
+        start = f"{rows['lr'][0]:.1e}", f"{rows['std'][0]:.2f}"
         cells = [success_at(rows, point * 1e6) for point in POINTS]
         print(f"| {os.path.basename(path)[:-4]} | " + " | ".join([*start, *cells]) + " |")
-        frames.append(int(rows[-1]["frames"]))
+        frames.append(rows["frames"][-1])
     print(f"\n{len(frames)} runs, {sum(frames) / 1e6:.0f} million frames")
 
 

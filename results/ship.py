@@ -6,11 +6,12 @@
 A checkpoint keeps the weights and loses the optimiser: it can be evaluated, not trained on. A CSV
 with more than 300 rows is thinned: each row then stands for a window of updates, with the window's
 last update, frames, seconds and lr, the sum of its episodes and the mean of everything else.
-zeroshot.csv files are copied as they are. A run that is shipped already is refused.
+zeroshot.csv files are copied as they are. A run that is shipped with its scores is refused.
 """
 import argparse
 import csv
 import glob
+import math
 import os
 import shutil
 import sys
@@ -26,8 +27,8 @@ SUMS = ("episodes", "cut_short")
 
 def thinned(rows):
     """At most ROWS rows (dicts of text) that stand for windows of the given ones."""
-    window = -(-len(rows) // ROWS)                             # rounded up
-    if window == 1:
+    window = math.ceil(len(rows) / ROWS)
+    if window <= 1:
         return rows
     return [together(rows[i:i + window]) for i in range(0, len(rows), window)]
 
@@ -49,9 +50,10 @@ def together(rows):
 def thin_file(source, target):
     """Write a thinned copy of a CSV."""
     with open(source, newline="") as file:
-        rows = list(csv.DictReader(file))
+        reader = csv.DictReader(file)
+        rows = list(reader)
     with open(target, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer = csv.DictWriter(file, reader.fieldnames, lineterminator="\n")
         writer.writeheader()
         writer.writerows(thinned(rows))
 
@@ -62,8 +64,8 @@ def ship(run, folder):
     if os.path.exists(os.path.join(folder, "zeroshot.csv")):
         raise ValueError(f"{folder} holds a run already: remove it first")
     os.makedirs(folder, exist_ok=True)
-    small = {name: value for name, value in checkpoint.items() if name != "optimizer"}
-    save(small, os.path.join(folder, "checkpoint.pt"))
+    checkpoint.pop("optimizer", None)
+    save(checkpoint, os.path.join(folder, "checkpoint.pt"))
     for name in ("progress.csv", "timing.csv"):
         thin_file(os.path.join(run, name), os.path.join(folder, name))
     for path in glob.glob(os.path.join(run, "zeroshot*.csv")):

@@ -3,9 +3,9 @@
     python results/thrown.py results/push-lrn-n2-seed0                    50 episodes at N = 2
     python results/thrown.py RUN [RUN ...] --episodes 20
 
-Prints one row per run, means over all steps of its episodes, played with sampled actions as in
-training: the target cube's speed; the share of steps in which it is faster than FAST; the share in
-which its centre lies further out than GRASP_RADIUS, where a finger can no longer get behind it
+Prints one row per run, means over its episodes, of each over its steps, played with sampled actions
+as in training: the target cube's speed; the share of steps in which it is faster than FAST; the
+share in which its centre lies further out than GRASP_RADIUS, where a finger can no longer get behind it
 from every side; and the score at the end (axis-aligned).
 """
 import math
