@@ -5,8 +5,8 @@
 
 Prints one row per run, means over its episodes, of each over its steps, played with sampled actions
 as in training: the target cube's speed; the share of steps in which it is faster than FAST; the
-share in which its centre lies further out than GRASP_RADIUS, where a finger can no longer get behind it
-from every side; and the score at the end (axis-aligned).
+share in which its centre lies further out than GRASP_RADIUS, where a finger can no longer get
+behind it from every side; and the score at the end (axis-aligned).
 """
 import math
 import os
