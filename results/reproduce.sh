@@ -88,6 +88,8 @@ all_runs() {
                 substeps=3 timestep=0.004 episode_steps=2500 steps=2500 envs=2
             a_run push lrn 2 $seed slippery --set $paper_cube $paper_reward
             a_run push lrn 2 $seed paper --paper                # the printed recipe, 60 M frames
+            a_run push lrn 2 $seed paper-script --paper --set clip=0.2 reward_distance=2500 \
+                reward_reach=2500 reward_curiosity=0           # as CausalWorld's own script
             a_run push lrn 2 $seed paper-values --paper --set normalize_values=True
             a_run push lrn 2 $seed paper-normalized --paper --set normalize_values=True \
                 normalize_advantages=True
