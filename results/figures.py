@@ -316,40 +316,39 @@ def frames_to(runs, threshold):
     return np.array(found)
 
 
-def draw_frames_to(panel, groups, threshold, row, label, name, marker, color):
-    """A dot a run, at the N of its training; "never" stands in line `row` from the top."""
+def draw_frames_to(panel, groups, threshold, row, label, million, name, marker, color):
+    """A dot a run, at the N of its training; "not in 3 M" stands in line `row` from the top."""
     runs = [(N, run) for N in range(4) for run in groups.get(name.format(N), [])]
     places = [N for N, _ in runs]
     frames = frames_to([run for _, run in runs], threshold)
-    if not runs:
-        label += " (not run)"
+    label = f"{label}, {million} M frames" + ("" if runs else " (not run)")
     panel.plot(places, frames, marker, color=color, alpha=0.7, label=label)
     for N in {N for N, needed in zip(places, frames) if np.isnan(needed)}:
-        panel.annotate("never", (N, 1), (0, -14 * (row + 1)), color=color, ha="center",
+        panel.annotate(f"not in {million} M", (N, 1), (0, -14 * (row + 1)), color=color, ha="center",
                        xycoords=("data", "axes fraction"), textcoords="offset points")
 
 
 def figure_1(folder):
     """Figure 1, right: frames until training success is 0.5 and 0.8, by the N of training.
 
-    "Never" is within the run's frames. The MLP's long runs are other runs than its short ones, as
-    the learning rate falls to 0 at the end of each.
+    The MLP's long runs are other runs than its short ones, as the learning rate falls to 0 at the
+    end of each.
     """
     plt = pyplot()
     groups = by_seed(shipped_runs())
     need_runs(groups, [f"push-mlp-n{N}" for N in range(3)])
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained", sharey=True)
-    lines = (("MLP, 9 M frames", "push-mlp-n{}-long", "s", RED),
-             ("MLP, 3 M frames", "push-mlp-n{}", "o", YELLOW),
-             ("LRN, 3 M frames", "push-lrn-n{}", "o", BLUE))
+    lines = (("MLP", 9, "push-mlp-n{}-long", "s", RED),
+             ("MLP", 3, "push-mlp-n{}", "o", YELLOW),
+             ("LRN", 3, "push-lrn-n{}", "o", BLUE))
     for threshold, panel in zip((0.5, 0.8), axes):
         for row, line in enumerate(lines):
             draw_frames_to(panel, groups, threshold, row, *line)
         panel.set(title=f"PushingCube: frames to reach {threshold}", xlabel="N in training",
                   xticks=range(4), xlim=(-0.5, 3.5))
-        panel.margins(y=0.4)                                   # room for "never"
+        panel.margins(y=0.4)                                   # room for "not in 3 M"
     axes[0].set(ylabel="million frames, each run a dot", ylim=(0, None))
-    axes[0].legend(loc="lower right")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     save(figure, folder, "figure1.png")
 
 
