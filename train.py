@@ -348,7 +348,7 @@ class Run:
         }
 
     def save(self, checkpoint):
-        """Replace the run's checkpoint; scores of the weights before go with them."""
+        """Replace the run's checkpoint, and remove scores: they are of the weights before."""
         for name in ("zeroshot.csv", "zeroshot-sampled.csv"):
             if os.path.exists(self.path(name)):
                 os.remove(self.path(name))
