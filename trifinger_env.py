@@ -233,8 +233,8 @@ def volume(faces):
 def squares_overlap(a, b):
     """(n, m) bool: does square i of a (n, 4) touch square j of b (m, 4)?
 
-    Rows are x, y, yaw, half edge. Two squares are apart if, along the direction of
-    some edge of either, their projections do not meet (separating axes).
+    Rows are x, y, yaw, half edge. Two squares are apart if, along the direction of some edge of
+    either, their projections do not meet (separating axes).
     """
     a, b = np.asarray(a)[:, None], np.asarray(b)[None]         # (n, 1, 4), (1, m, 4)
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
