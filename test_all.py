@@ -2027,7 +2027,8 @@ def test_every_rank_draws_other_episodes_and_other_noise():
 
 def run_arguments(**changes):
     return SimpleNamespace(**{"encoder": "lrn", "task": "push", "distractors": 1, "seed": 0,
-                              "out": "nowhere", "resume": False, "save_minutes": 3.0, **changes})
+                              "ranks": 1, "out": "nowhere", "resume": False,
+                              "save_minutes": 3.0, **changes})
 
 
 def test_every_setting_reaches_the_learner_and_its_environments():
@@ -2042,7 +2043,7 @@ def test_every_setting_reaches_the_learner_and_its_environments():
     of_the_agent = {"token_dim", "z_dim", "hidden", "heads", "relations", "layer_norm", "log_std"}
     assert {*of_ppo, *of_env, *others} == set(train.SETTINGS) - of_the_agent - {"frames"}
     settings = {**train.DEFAULTS, **of_ppo, **of_env, **others}
-    learner = train.make_learner(run_arguments(task="lift"), settings, ranks=2)
+    learner = train.make_learner(run_arguments(task="lift", ranks=2), settings)
     for name, value in of_ppo.items():
         assert getattr(learner, name) == value, name
     assert (learner.entropy_coef, learner.auxiliary_coef) == (0.6, 0.9)
@@ -2068,7 +2069,7 @@ def test_the_environment_alone_is_the_one_of_a_run_with_default_settings():
 def test_first_weights_depend_on_the_seed_alone():
     def first_weights(seed):
         settings = {**train.DEFAULTS, "envs": 1, "minibatches": 1}
-        learner = train.make_learner(run_arguments(seed=seed), settings, 1)
+        learner = train.make_learner(run_arguments(seed=seed), settings)
         learner.envs[0].close()
         return learner.weights
 
@@ -2215,7 +2216,7 @@ def test_first_row_of_two_ranks_is_about_the_episodes_of_both(trained):
     checkpoint, _ = train.load(trained)
     episodes = []
     for rank in range(2):
-        learner = train.make_learner(run_arguments(distractors=0), checkpoint["settings"], ranks=2)
+        learner = train.make_learner(run_arguments(distractors=0, ranks=2), checkpoint["settings"])
         episodes += learner.rollout(train.reseed(0, 0, rank, 4))
         for env in learner.envs:
             env.close()
@@ -2268,7 +2269,7 @@ def test_columns_about_episodes_by_hand():
 
 def test_a_checkpoint_is_due_after_its_minutes(monkeypatch):
     monkeypatch.setattr(time, "monotonic", lambda: 1000.0)
-    due = train.Run(run_arguments(save_minutes=2.0), train.DEFAULTS, 1, None).is_due
+    due = train.Run(run_arguments(save_minutes=2.0), train.DEFAULTS, None).is_due
     for seconds, expected in ((119, False), (121, True)):
         monkeypatch.setattr(time, "monotonic", lambda: 1000.0 + seconds)
         assert due() == expected
@@ -4151,7 +4152,7 @@ MUTATIONS = {
         ("math.ceil(settings[\"frames\"] / self.frames_per_update)",
          "settings[\"frames\"] // self.frames_per_update",
          "test_every_update_plays_other_episodes_and_is_told_how_much_is_left"),
-        ("range(settings[\"envs\"] // ranks)", "range(settings[\"envs\"])",
+        ("range(settings[\"envs\"] // args.ranks)", "range(settings[\"envs\"])",
          "test_every_setting_reaches_the_learner_and_its_environments"),
         ("\"cube_mass\", \"finger_friction\", \"goal_yaw\")", "\"cube_mass\", \"goal_yaw\")",
          "test_every_setting_reaches_the_learner_and_its_environments"),

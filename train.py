@@ -314,8 +314,8 @@ def add_row(path, columns, row):
 class Run:
     """The folder of a run and how far it has come; rank 0 alone writes to it."""
 
-    def __init__(self, args, settings, ranks, learner):
-        self.args, self.settings, self.ranks, self.learner = args, settings, ranks, learner
+    def __init__(self, args, settings, learner):
+        self.args, self.settings, self.learner = args, settings, learner
         self.update, self.seconds = 0, 0.0
         self.frames_per_update = settings["envs"] * settings["steps"]
         self.last_update = math.ceil(settings["frames"] / self.frames_per_update)
@@ -338,7 +338,7 @@ class Run:
             "task": self.args.task,
             "distractors": self.args.distractors,
             "seed": self.args.seed,
-            "ranks": self.ranks,
+            "ranks": self.args.ranks,
             "settings": self.settings,
             "update": self.update,
             "frames": self.update * self.frames_per_update,
@@ -434,12 +434,12 @@ def catch_signals(rank):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def make_learner(args, settings, ranks):
+def make_learner(args, settings):
     """PPO with its agent and this rank's environments; every rank starts from the same weights."""
     torch.manual_seed(args.seed)
     agent = Agent(args.encoder, args.distractors, settings)
     envs = [make_env(args.task, args.distractors, settings)
-            for _ in range(settings["envs"] // ranks)]
+            for _ in range(settings["envs"] // args.ranks)]
     return PPO(agent, envs, **{name: settings[name] for name in PPO_SETTINGS})
 
 
@@ -505,13 +505,12 @@ def train(args, settings):
     A stop does not wait for the update under way, which can take minutes with --paper: it is given
     up, and the run is saved as it was before it.
     """
-    ranks = args.ranks
     before = None
     try:
-        rank = join_ranks(ranks)
+        rank = join_ranks(args.ranks)
         catch_signals(rank)
-        learner = make_learner(args, settings, ranks)
-        run = Run(args, settings, ranks, learner)
+        learner = make_learner(args, settings)
+        run = Run(args, settings, learner)
         if args.resume:                  # every rank reads the file: spawn would share the tensors
             run.restore()
         if rank == 0:
@@ -523,13 +522,13 @@ def train(args, settings):
     except KeyboardInterrupt:            # in rank 0 alone
         if before is None:
             print("stopped before any update of this call")
-            leave_ranks(ranks, stopped=True)
+            leave_ranks(args.ranks, stopped=True)
         run.save(before)
     stopped = before["update"] < run.last_update
     if rank == 0:
         print(f"{'stopped' if stopped else 'finished'} after {before['update']} updates, "
               f"{before['seconds'] / 60:.1f} minutes: {run.path('checkpoint.pt')}")
-    leave_ranks(ranks, stopped)
+    leave_ranks(args.ranks, stopped)
 
 
 # ---- the command line

@@ -60,7 +60,7 @@ def main():
     parser.add_argument("--updates", type=positive, default=10, metavar="U")
     parser.add_argument("--paper", action="store_true", help="the paper's settings")
     args = parser.parse_args()
-    command = read_command(["--paper"] if args.paper else [])
+    command = read_command(["--ranks", "2"] + ["--paper"] * args.paper)
     settings = read_settings(command)
     torch.set_num_threads(1)
     put_clock_on(pybullet, "stepSimulation")
@@ -68,7 +68,7 @@ def main():
     put_clock_on(TriFingerEnv, "reset")
     put_clock_on(PPO, "rollout")
     put_clock_on(PPO, "update")
-    frames = train(args.updates, make_learner(command, settings, ranks=2))
+    frames = train(args.updates, make_learner(command, settings))
     total = spent["rollout"] + spent["update"]
     parts = {
         "bare physics": spent["stepSimulation"],
