@@ -73,6 +73,8 @@ class ATTN(nn.Module):
         Row i of the weights says what token i looks at; padding is never looked at.
         """
         check_shapes(self.token_dim, objects, goal, present)
+        if present is not None:                                # NaN in padding would spread by @
+            objects = objects.masked_fill(~present[..., None], 0.0)
         tokens = torch.cat([objects, goal[:, None]], dim=1)    # (B, K+1, D)
         q = self.split_heads(self.q(tokens))                   # (B, H, K+1, D/H)
         k = self.split_heads(self.k(tokens))                   # (B, H, K+1, D/H)

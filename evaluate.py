@@ -7,11 +7,11 @@
     python evaluate.py RUN --gif push.gif --distractors 9    a film of one episode
 
 Episode j starts from the same seed at every N and for every agent: goal, target cube and the first
-distractors stand in the same places (unless a crowd has to be nudged). What is drawn after them
-differs: identifiers, the target's row and a lifting goal's height. The seeds belong to no training
-run (but one with --seed 20220131). The paper does not say whether its scores are of sampled actions
-or of the policy's means; CausalWorld's evaluation plays the means, and so do we. results/README.md
-explains the table's columns ("Words").
+distractors stand in the same places (unless a crowd has to be nudged, or an agent was trained with
+another goal_yaw). What is drawn after them differs: identifiers, the target's row and a lifting
+goal's height. The seeds belong to no training run (but one with --seed 20220131). The paper does
+not say whether its scores are of sampled actions or of the policy's means; CausalWorld's evaluation
+plays the means, and so do we. results/README.md explains the table's columns ("Words").
 """
 import argparse
 import csv
@@ -102,8 +102,9 @@ def trained_z(checkpoint, agent, episodes):
 
 
 def drift_of(z, z_trained):
-    """Distances of z (B, Z) from z_trained (B, Z), over the mean between two rows of that: (B,).
+    """How far each row of z (B, Z) lies from the same row of z_trained (B, Z): (B,).
 
+    In units of the mean distance between two rows of z_trained.
     Identifiers and a lifting goal's height are drawn after the distractors, so they differ at
     another N and move z, too. NaN for a single row.
     """
@@ -272,9 +273,8 @@ def play_all(path, numbers, episodes, sample_actions):
         for n in numbers:
             played = [episode for _ in parts for episode in next(results)]
             rows.append(summary(n, played))
-            share = len(rows) / len(numbers)
-            elapsed = time.monotonic() - begin
-            print_row(rows[-1], elapsed / share - elapsed)
+            seconds_each = (time.monotonic() - begin) / len(rows)
+            print_row(rows[-1], seconds_each * (len(numbers) - len(rows)))
     return rows
 
 
@@ -345,6 +345,8 @@ def watch(run, distractors, episodes, sample_actions):
         if pybullet.isConnected(env._client):
             raise
         print("the window was closed")
+    except KeyboardInterrupt:
+        print("stopped")
 
 
 @torch.inference_mode()
@@ -379,12 +381,12 @@ def parse_range(text):
         for part in text.split(","):
             low, _, high = part.partition("-")
             first, last = int(low), int(high or low)
-            last = min(last, max(first, len(IDENTIFIERS)))     # 0-999999999 must not fill memory
+            if last < first:
+                raise ValueError
+            last = min(last, first + len(IDENTIFIERS))         # 0-999999999 must not fill memory
             numbers.update(range(first, last + 1))
     except ValueError:
         fail(f"--distractors must look like 0-9 or 0,2,5, got {text!r}")
-    if not numbers:
-        fail(f"--distractors {text!r} names no number")
     return sorted(numbers)
 
 
@@ -415,7 +417,7 @@ def read_command():
 
 
 def show(args):
-    """--watch and --gif: the first run at the first N, by default the one it was trained at."""
+    """--watch and --gif: the first run at the smallest N given, by default as it was trained."""
     run = args.runs[0]
     trained = load(run)[0]["distractors"]
     distractors = parse_range(args.distractors)[0] if args.distractors else trained
@@ -435,9 +437,13 @@ def sweep(args):
         if args.save:
             check_csv(run, name)
     for run in args.runs:
+        update = load(run)[0]["update"]
         rows = evaluate(run, numbers, args.episodes, args.sample_actions)
-        if args.save and rows:
-            save_rows(os.path.join(run, name), rows)
+        if not (args.save and rows):
+            continue
+        if load(run)[0]["update"] != update:
+            raise ValueError(f"{run} was trained on meanwhile: its scores are not saved")
+        save_rows(os.path.join(run, name), rows)
 
 
 def main():

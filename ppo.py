@@ -132,10 +132,11 @@ class PPO(nn.Module):
     def rollout(self, seeds):
         """Play T steps in every environment, environment e from reset(seed=seeds[e]).
 
-        Starting fresh makes an update a function of weights and seeds alone, which is what lets a
-        run resume exactly. Leaves the batch for update() in self.observations and self.batch, and
-        self.explained_variance for its diagnostics. Returns the finished episodes: dicts with
-        "return", "length" and "info", that of the last step.
+        Starting fresh makes an update a function of these seeds, torch's generator and the state
+        of learner and optimiser, which is what lets a run resume exactly. Leaves the batch for
+        update() in self.observations and self.batch, and self.explained_variance for its
+        diagnostics. Returns the finished episodes: dicts with "return", "length" and "info", that
+        of the last step.
         """
         first = [env.reset(seed=seed)[0] for env, seed in zip(self.envs, seeds)]
         self.make_storage(first[0])

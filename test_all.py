@@ -222,7 +222,8 @@ def test_encoder_ignores_order_and_padding_and_serves_any_number(make):
         assert z.shape == (2, 25) and torch.equal(z, other(objects, goal))
         shuffled = encoder(objects[:, torch.randperm(K)], goal)
         torch.testing.assert_close(z, shuffled, atol=1e-4, rtol=1e-4)
-        padded = torch.cat([objects, 1e3 * torch.randn(2, 3, D)], dim=1)
+        padding = torch.tensor([1e3, math.nan, math.inf])[:, None].expand(2, -1, D)
+        padded = torch.cat([objects, padding], dim=1)
         present = torch.arange(K + 3).expand(2, -1) < K
         ignored = encoder(padded, goal, present)
         torch.testing.assert_close(z, ignored, atol=1e-4, rtol=1e-4)
@@ -2263,8 +2264,6 @@ def test_columns_about_episodes_by_hand():
     expected = {"episodes": 4, "return": 3.0, "length": 32.0, "success_aabb": 2.59 / 4,
                 "success_strict": 1.7 / 4, "solved": 0.5, "cut_short": 1}
     assert train.summarize(sums) == pytest.approx(expected)
-    nothing = train.summarize(train.episode_sums([]))
-    assert nothing["episodes"] == 0 and math.isnan(nothing["return"])
 
 
 def test_a_checkpoint_is_due_after_its_minutes(monkeypatch):
@@ -3197,6 +3196,23 @@ def test_ctrl_c_keeps_the_scores_of_runs_played_to_the_end(
     assert not os.path.exists(second / "zeroshot.csv")
 
 
+def test_scores_are_not_saved_if_the_run_was_trained_on_meanwhile(
+        trained, tmp_path, command, monkeypatch, capsys):
+    out = shutil.copytree(trained, tmp_path / "run")
+    evaluate_run = evaluate.evaluate
+
+    def evaluate_and_train_on(run, *rest):
+        rows = evaluate_run(run, *rest)
+        save_changed(run, run, {"update": 41})
+        return rows
+
+    monkeypatch.setattr(evaluate, "evaluate", evaluate_and_train_on)
+    with pytest.raises(SystemExit):
+        command("evaluate.py", out, "--distractors 0 --episodes 1 --save")
+    assert "meanwhile" in capsys.readouterr().err
+    assert not os.path.exists(out / "zeroshot.csv")
+
+
 def test_ranges_of_distractors():
     for text, expected in (("0-3", [0, 1, 2, 3]), ("14,2,5", [2, 5, 14]), ("0-2,1-3,9",
                            [0, 1, 2, 3, 9]), ("7", [7]), ("5,25", [5, 25])):
@@ -3217,6 +3233,17 @@ def test_watching_plays_the_evaluated_episodes(played_task, simple, monkeypatch,
     lines = capsys.readouterr().out.splitlines()[1:]
     assert [line.split()[-1] for line in lines] == [f"{rho:.2f}" for rho in expected]
     assert [line.split(":")[0] for line in lines] == ["episode 0", "episode 1", "episode 2"]
+
+
+def test_ctrl_c_ends_watching(simple, monkeypatch, capsys):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    env = train.make_env("push", 2, simple["settings"])
+    monkeypatch.setattr(evaluate, "make_env", lambda *_, **__: env)
+    monkeypatch.setattr(evaluate, "play_live", stopped)
+    evaluate.watch("simple", 2, 3, True)
+    assert capsys.readouterr().out.endswith("stopped\n")
 
 
 @pytest.mark.parametrize("substeps, pictures, milliseconds", [(5, 8, 80), (20, 16, 160)])
@@ -3812,6 +3839,8 @@ MUTATIONS = {
         ("self.norm(self.f(", "(self.f(", "test_rn_equals_the_double_loop_over_pairs"),
     ),
     "attn.py": (
+        ("objects = objects.masked_fill(~present[..., None], 0.0)", "pass",
+         "test_encoder_ignores_order_and_padding_and_serves_any_number"),
         (" / math.sqrt(q.shape[-1])", "", "test_attention_equals_torch_multihead_attention"),
         ("score.softmax(dim=-1)", "score.softmax(dim=-2)",
          "test_attention_equals_torch_multihead_attention"),
@@ -4255,9 +4284,14 @@ MUTATIONS = {
          "test_watching_plays_the_evaluated_episodes"),
         ("episodes[first:first + CHUNK]", "range(first, first + CHUNK)",
          "test_evaluation_prints_each_n_as_it_is_done_with_the_time_left"),
-        ("elapsed / share - elapsed", "elapsed / share",
+        ("seconds_each * (len(numbers) - len(rows))", "seconds_each * len(numbers)",
          "test_evaluation_prints_each_n_as_it_is_done_with_the_time_left"),
-        ("if args.save and rows:", "if rows:",
+        ("load(run)[0][\"update\"] != update", "False",
+         "test_scores_are_not_saved_if_the_run_was_trained_on_meanwhile"),
+        ("if last < first:", "if False:", "test_bad_input_ends_with_one_line_and_status_2"),
+        ("    except KeyboardInterrupt:\n        print(\"stopped\")", "    except FileNotFoundError:\n"
+         "        print(\"stopped\")", "test_ctrl_c_ends_watching"),
+        ("if not (args.save and rows):", "if not rows:",
          "test_evaluation_leaves_a_run_as_it_is_unless_asked_to_save"),
         ("for n in sorted(lines)", "for n in lines",
          "test_rows_are_saved_in_order_and_other_n_stay"),

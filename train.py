@@ -392,7 +392,8 @@ class Run:
 # ---- training
 #
 # Rank 0 is the process that the user started. It alone writes files, prints, and catches Ctrl-C and
-# SIGTERM; the other ranks ignore Ctrl-C, and rank 0 ends them.
+# SIGTERM; the other ranks ignore Ctrl-C, and rank 0 ends them. (Under torchrun that starts and ends
+# all of them.)
 
 STOPPED = 130                            # exit status after a Ctrl-C, as shells have it
 NOISE_STREAM = 10 ** 6                   # stream e < 10^6: environment e; 10^6 + r: torch on rank r
@@ -409,7 +410,7 @@ def join_ranks(ranks):
 def leave_ranks(ranks, stopped):
     """Leave together, so that nobody waits for a rank that is gone.
 
-    A stop ends this process with the status of a Ctrl-C, and the others.
+    A stop does not return: it ends this process, with the status of a Ctrl-C, and the others.
     """
     if ranks == 1 and stopped:
         sys.exit(STOPPED)
@@ -463,7 +464,7 @@ def episode_sums(episodes):
              episode["info"]["fractional_success"], episode["info"]["fractional_success_strict"],
              episode["info"]["fractional_success"] >= SOLVED,
              episode["info"]["truncated_by"] != TIME] for episode in episodes]
-    return torch.tensor(rows or [[0.0] * len(EPISODE_SUMS)]).sum(dim=0)
+    return torch.tensor(rows).sum(dim=0)
 
 
 def summarize(sums):
@@ -522,7 +523,7 @@ def train(args, settings):
     except KeyboardInterrupt:            # in rank 0 alone
         if before is None:
             print("stopped before any update of this call")
-            leave_ranks(args.ranks, stopped=True)
+            leave_ranks(args.ranks, stopped=True)              # does not return
         run.save(before)
     stopped = before["update"] < run.last_update
     if rank == 0:

@@ -32,10 +32,10 @@ WALL_SIDES = 12                          # the round wall is made of so many box
 GRASP_RADIUS = 0.124                     # inside it a finger can get behind a cube, m
 OUTSIDE, BELOW, ABOVE = WALL + 0.03, -0.03, 1.0                # beyond them a cube has left, m
 CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multiplies the two in touch
-# A cube's mass and the fingers' friction are arguments, because sources differ. CausalWorld has
-# 0.08 kg (0.02 in its pushing and picking tasks) and 0.1, with which a cube can hardly be held
-# (results/grasp.py); trifinger_simulation 0.08 kg and 0.5; IsaacGymEnvs 0.08 kg and 1.0, as we do.
-# A real cube weighs 0.094 kg.
+# A cube's mass and the fingers' friction are arguments, because sources differ. CausalWorld (the
+# paper's simulator) has 0.08 kg (0.02 in its pushing and picking tasks) and 0.1, with which a cube
+# can hardly be held (results/grasp.py); trifinger_simulation 0.08 kg and 0.5; IsaacGymEnvs 0.08 kg
+# and 1.0, as we do. A real cube weighs 0.094 kg.
 IDENTIFIERS = np.linspace(-1.0, 1.0, 21)                       # pool: none is new when N grows
 HIGHEST_GOAL = 0.2                       # height of the centre of the highest goal in lifting, m
 FIXED = 5                                # squares never nudged: three fingers, goal, target

@@ -60,10 +60,13 @@ all_runs() {
                 a_run push mlp $N $seed long --frames 9000000
             done
             a_run push lrn-max 9 $seed                         # beyond the paper: 9 in training
+            a_run push lrn 2 $seed noreadout --set auxiliary=0 # without our read-out loss
         fi
         if [ $seed = 0 ]; then
-            for encoder in lrn rn attn; do                     # without our read-out loss
+            for encoder in rn attn; do
                 a_run push $encoder 2 $seed noreadout --set auxiliary=0
+            done
+            for encoder in lrn rn attn; do
                 a_run push $encoder 2 $seed noreadout-long --frames 20000000 --set auxiliary=0
             done
             a_run push lrn 0 $seed noreadout --set auxiliary=0
@@ -71,6 +74,8 @@ all_runs() {
                 $paper_reward
             a_run push lrn 2 $seed noreadout-paperworld --set auxiliary=0 $paper_world \
                 $paper_reward
+            a_run push lrn 2 $seed noreadout-paperworld-long --frames 10000000 --set auxiliary=0 \
+                $paper_world $paper_reward
             a_run push lrn 2 $seed noreadout-slippery --set auxiliary=0 $paper_cube \
                 $paper_reward
             a_run push lrn 2 $seed noreadout-absolute --set auxiliary=0 action_mode=absolute \
