@@ -3242,7 +3242,10 @@ def test_ctrl_c_ends_watching(simple, monkeypatch, capsys):
     env = train.make_env("push", 2, simple["settings"])
     monkeypatch.setattr(evaluate, "make_env", lambda *_, **__: env)
     monkeypatch.setattr(evaluate, "play_live", stopped)
-    evaluate.watch("simple", 2, 3, True)
+    try:
+        evaluate.watch("simple", 2, 3, True)
+    except KeyboardInterrupt:
+        pytest.fail("it got through")                          # it would end pytest itself
     assert capsys.readouterr().out.endswith("stopped\n")
 
 
