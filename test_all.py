@@ -8,10 +8,12 @@ Run:    pytest -q                                        3 to 4 minutes on 2 cor
 import ast
 import csv
 import functools
+import glob
 import io
 import itertools
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -919,9 +921,8 @@ def test_the_goal_names_the_target_and_no_other_cube(n):
         assert len(set(identifiers)) == n + 1
         assert np.abs(identifiers[:, None] - pool).min(axis=1).max() < 1e-6
         np.testing.assert_allclose(0.2 * obs["cubes"][env.target, 4:6], poses[1, :2], atol=1e-6)
-        for cube in range(n + 1):                              # a row is the cube it says
-            position, _ = pose_of(env, cube)
-            np.testing.assert_allclose(0.2 * obs["cubes"][cube, 4:7], position, atol=1e-6)
+        positions = [pose_of(env, cube)[0] for cube in range(n + 1)]         # row i is cube i
+        np.testing.assert_allclose(0.2 * obs["cubes"][:, 4:7], positions, atol=1e-6)
         drawn.append(env.target)
         used += identifiers.tolist()
     counts = np.bincount(drawn, minlength=n + 1)
@@ -1866,6 +1867,10 @@ def test_mlp_agent_sees_everything_and_has_a_fixed_input(env):
         assert ((agent(changed)[2] - value).abs() > 1e-6).all(), key
     swapped = {**obs, "cubes": obs["cubes"][:, [2, 0, 1]]}
     assert (agent(swapped)[2] - value).abs().max() > 1e-6
+    flat = torch.cat([obs["cubes"].flatten(1), obs["fingers"].flatten(1), obs["goal"]], dim=1)
+    network, norm = agent.encoder
+    assert [layer.out_features for layer in network if hasattr(layer, "weight")] == [256, 256, 25]
+    same(agent.encode(obs), norm(network(flat)))
     with pytest.raises(ValueError, match="trained with 2 distractors and cannot be used with 1"):
         agent({**obs, "cubes": obs["cubes"][:, :2]})
 
@@ -2104,6 +2109,16 @@ def test_paper_sets_the_numbers_of_the_paper_and_of_its_sources(tmp_path):
     assert settings == {**train.DEFAULTS, "frames": 77, "lr_power": 1.0}
 
 
+def test_paper_trains_without_our_read_out(tmp_path, command):
+    """Of what --paper changes, what a row of progress.csv tells."""
+    out = tmp_path / "run"
+    command("train.py --paper --ranks 1 --frames 200 --out", out, *SMALL)
+    row, = read_csv(out / "progress.csv")
+    assert row["auxiliary_loss"] == 0 and row["std"] == pytest.approx(1, abs=0.01)
+    assert row["value_loss"] > 100                             # of raw returns
+    assert row["return"] < -50 * 50                            # paid by the curiosity term
+
+
 def test_lifting_has_frames_schedule_and_noise_of_its_own(tmp_path):
     out = str(tmp_path / "run")
     for words, power, log_std in (("", 1, -0.7), ("--task lift", 2, -1), ("--paper", 1, 0),
@@ -2162,6 +2177,27 @@ def command(monkeypatch):
     yield call
     for number, handler in handlers.items():
         signal.signal(number, handler)
+
+
+class InThisProcess:
+    """Stands in for multiprocessing's context and pool: calls come one by one, when asked for."""
+
+    def Pool(self, *_, **__):
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    imap = staticmethod(map)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Evaluation starts no other processes, which would take most of the time."""
+    monkeypatch.setattr(evaluate.multiprocessing, "get_context", lambda kind: InThisProcess())
 
 
 @torch.no_grad()
@@ -2275,7 +2311,7 @@ def test_a_checkpoint_is_due_after_its_minutes(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["lrn-max", "rn", "attn", "mlp"])
-def test_other_encoders_train_and_are_evaluated(kind, tmp_path, command, capsys):
+def test_other_encoders_train_and_are_evaluated(kind, tmp_path, command, in_this_process, capsys):
     out = tmp_path / "run"
     command("train.py --distractors 1 --ranks 1 --frames 200 --encoder", kind, "--out", out, *SMALL)
     command("evaluate.py --distractors 0,1 --episodes 2 --save", out)
@@ -2464,6 +2500,20 @@ def test_ctrl_c_before_the_first_update_ends_both_ranks(delay, tmp_path):
     assert process.returncode == 130 and "stopped" in printed and "Traceback" not in errors, errors
 
 
+def assert_same_run(whole, cut):
+    """Bit-equal weights, byte-equal progress.csv, and time goes on where it stopped."""
+    expected, ours = (torch.load(folder / "checkpoint.pt", weights_only=True)
+                      for folder in (whole, cut))
+    assert expected["update"] == ours["update"]
+    for key, value in expected["learner"].items():
+        assert torch.equal(value, ours["learner"][key]), key
+    assert read(whole / "progress.csv") == read(cut / "progress.csv")
+    times = read_csv(cut / "timing.csv")
+    assert [row["update"] for row in times] == list(range(1, ours["update"] + 1))
+    assert (np.diff([row["seconds"] for row in times]) > 0).all()
+    assert ours["seconds"] == pytest.approx(times[-1]["seconds"], abs=0.01)
+
+
 @needs_proc
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_stopped_killed_and_resumed_equals_never_stopped(ranks, tmp_path):
@@ -2495,12 +2545,8 @@ def test_stopped_killed_and_resumed_equals_never_stopped(ranks, tmp_path):
     assert done.returncode == 0 and not os.path.exists(cut / "zeroshot.csv"), done.stderr
     _, errors = never_stopped.communicate(timeout=900)
     assert never_stopped.returncode == 0, errors
-    expected, ours = (torch.load(folder / "checkpoint.pt", weights_only=True)
-                      for folder in (whole, cut))
-    assert expected["update"] == ours["update"] == updates
-    for key, value in expected["learner"].items():
-        assert torch.equal(value, ours["learner"][key]), key
-    assert read(whole / "progress.csv") == read(cut / "progress.csv")
+    assert train.load(str(whole))[0]["update"] == updates
+    assert_same_run(whole, cut)
 
 
 @pytest.mark.parametrize("options", ["", "--encoder rn --task lift", "--encoder attn",
@@ -2526,10 +2572,7 @@ def test_a_stop_in_the_middle_of_an_update_goes_back_to_its_beginning(
     assert stop.value.code == 130 and "stopped after 2 updates" in capsys.readouterr().out
     assert train.load(str(cut))[0]["frames"] == 400
     command(*words, cut, "--resume")
-    expected, ours = (torch.load(folder / "checkpoint.pt", weights_only=True)["learner"]
-                      for folder in (whole, cut))
-    assert all(torch.equal(value, ours[key]) for key, value in expected.items())
-    assert read(whole / "progress.csv") == read(cut / "progress.csv")
+    assert_same_run(whole, cut)
 
 
 @needs_proc
@@ -2578,13 +2621,11 @@ def test_resuming_a_finished_run_changes_nothing(trained, tmp_path, command, cap
     out = tmp_path / "run"
     shutil.copytree(trained, out)
     (out / "zeroshot.csv").write_text("of these weights")
-    before = files_below(out)
     save_changed(trained, out, {"ranks": 1})                   # stay in this process
+    before = files_below(out)
     command("train.py --resume --distractors 0 --out", out)
     assert "finished after 40 updates" in capsys.readouterr().out
-    after = files_below(out)
-    assert after.pop(str(out / "checkpoint.pt")) != before.pop(str(out / "checkpoint.pt"))
-    assert after == before
+    assert files_below(out) == before
 
 
 def test_resume_drops_rows_after_the_checkpoint_and_torn_lines(tmp_path):
@@ -2962,8 +3003,11 @@ def test_an_episode_that_ends_for_another_reason_is_cut_short(simple, monkeypatc
     monkeypatch.setattr(evaluate, "to_the_end", lambda *_: [
         {"fractional_success": 0.5, "fractional_success_strict": 0.25, "truncated_by": reason}
         for reason in reasons])
+    blocked = iter([True, False, True])
+    monkeypatch.setattr(evaluate, "is_blocked", lambda obs: next(blocked))
     episodes = evaluate.play(simple, Simple(), 0, range(3), False)
     assert [episode.cut_short for episode in episodes] == [False, True, True]
+    assert [episode.blocked for episode in episodes] == [True, False, True]
     assert {(episode.success_aabb, episode.success_strict) for episode in episodes} == {(0.5, 0.25)}
 
 
@@ -3054,23 +3098,8 @@ def test_a_row_is_printed_as_it_is(capsys):
                        "about 2.5 min left").split()
 
 
-class InThisProcess:
-    """Stands in for multiprocessing's context and pool: calls come one by one, when asked for."""
-
-    def Pool(self, *_, **__):
-        return self
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
-    imap = staticmethod(map)
-
-
 def test_a_run_that_trains_on_meanwhile_does_not_change_what_is_evaluated(
-        trained, tmp_path, monkeypatch):
+        trained, tmp_path, in_this_process, monkeypatch):
     """Its checkpoint is replaced after the look at it, before the first episode is played."""
     def read_errors(run):
         return [row["read_error"] for row in evaluate.evaluate(str(run), [0, 1], 2)]
@@ -3092,7 +3121,8 @@ def test_a_run_that_trains_on_meanwhile_does_not_change_what_is_evaluated(
     assert read_errors(copy) != expected
 
 
-def test_evaluation_prints_each_n_as_it_is_done_with_the_time_left(simple, monkeypatch, capsys):
+def test_evaluation_prints_each_n_as_it_is_done_with_the_time_left(
+        simple, in_this_process, monkeypatch, capsys):
     """60 episodes are three chunks a minute long each: 9 minutes in all for three N."""
     clock, calls, printed = [0.0], [], []
 
@@ -3103,7 +3133,6 @@ def test_evaluation_prints_each_n_as_it_is_done_with_the_time_left(simple, monke
         return [evaluate.Episode(0.1 * n, 0.0, False, False, 0.0, 0.0)] * len(episodes)
 
     monkeypatch.setattr(evaluate, "play", play)
-    monkeypatch.setattr(evaluate.multiprocessing, "get_context", lambda kind: InThisProcess())
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     rows = evaluate.evaluate("simple", [0, 2, 7], 60)
     printed += capsys.readouterr().out.splitlines()
@@ -3141,7 +3170,8 @@ def test_evaluation_leaves_a_run_as_it_is_unless_asked_to_save(trained, tmp_path
     assert set(files_below(out)) - set(before) == {str(out / "zeroshot.csv")}
 
 
-def test_a_checkpoint_of_any_name_can_be_evaluated(trained, tmp_path, command, capsys):
+def test_a_checkpoint_of_any_name_can_be_evaluated(
+        trained, tmp_path, command, in_this_process, capsys):
     shutil.copy(os.path.join(trained, "checkpoint.pt"), tmp_path / "best.pt")
     lines = []
     for path in (trained, tmp_path / "best.pt"):
@@ -3164,7 +3194,7 @@ def test_rows_are_saved_in_order_and_other_n_stay(tmp_path):
                      "9,7" + 11 * ",0.2500"]
 
 
-def test_sampled_actions_are_saved_apart(tmp_path, command):
+def test_sampled_actions_are_saved_apart(tmp_path, command, in_this_process):
     """By an agent whose scores tell sampled actions from mean ones."""
     out = tmp_path / "run"
     out.mkdir()
@@ -3179,7 +3209,7 @@ def test_sampled_actions_are_saved_apart(tmp_path, command):
 
 
 def test_ctrl_c_keeps_the_scores_of_runs_played_to_the_end(
-        trained, tmp_path, command, monkeypatch, capsys):
+        trained, tmp_path, command, in_this_process, monkeypatch, capsys):
     first, second = (shutil.copytree(trained, tmp_path / name) for name in ("first", "second"))
     evaluate_run = evaluate.evaluate
 
@@ -3197,7 +3227,7 @@ def test_ctrl_c_keeps_the_scores_of_runs_played_to_the_end(
 
 
 def test_scores_are_not_saved_if_the_run_was_trained_on_meanwhile(
-        trained, tmp_path, command, monkeypatch, capsys):
+        trained, tmp_path, command, in_this_process, monkeypatch, capsys):
     out = shutil.copytree(trained, tmp_path / "run")
     evaluate_run = evaluate.evaluate
 
@@ -3207,10 +3237,20 @@ def test_scores_are_not_saved_if_the_run_was_trained_on_meanwhile(
         return rows
 
     monkeypatch.setattr(evaluate, "evaluate", evaluate_and_train_on)
-    with pytest.raises(SystemExit):
+    with pytest.raises(SystemExit) as end:
         command("evaluate.py", out, "--distractors 0 --episodes 1 --save")
-    assert "meanwhile" in capsys.readouterr().err
+    assert end.value.code == 2 and "meanwhile" in capsys.readouterr().err
     assert not os.path.exists(out / "zeroshot.csv")
+
+
+def test_commands_without_options_mean_what_the_readme_says(command, monkeypatch):
+    calls = []
+    monkeypatch.setattr(evaluate, "evaluate", lambda *given: calls.append(given) or [])
+    monkeypatch.setattr(evaluate, "watch", lambda *given: calls.append(given))
+    shipped = os.path.join(HERE, "results", "push-lrn-n2-seed1")
+    command("evaluate.py", shipped)
+    command("evaluate.py --watch", shipped)
+    assert calls == [(shipped, list(range(10)), 200, False), (shipped, 2, 200, False)]
 
 
 def test_ranges_of_distractors():
@@ -3247,6 +3287,22 @@ def test_ctrl_c_ends_watching(simple, monkeypatch, capsys):
     except KeyboardInterrupt:
         pytest.fail("it got through")                          # it would end pytest itself
     assert capsys.readouterr().out.endswith("stopped\n")
+
+
+def test_closing_the_window_ends_watching(simple, monkeypatch, capsys):
+    env = train.make_env("push", 2, simple["settings"])
+    client = env._client
+
+    def closed(*_):
+        env.close()
+        env._client = client             # what a window that the user closes leaves behind
+        raise pb.error("Not connected to physics server.")
+
+    monkeypatch.setattr(evaluate, "make_env", lambda *_, **__: env)
+    monkeypatch.setattr(evaluate, "play_live", closed)
+    evaluate.watch("simple", 2, 3, True)
+    assert capsys.readouterr().out.endswith("the window was closed\n")
+    env._client = None
 
 
 @pytest.mark.parametrize("substeps, pictures, milliseconds", [(5, 8, 80), (20, 16, 160)])
@@ -3355,11 +3411,31 @@ def test_reweighing_changes_nothing_at_the_n_of_training(kind, results_scripts):
 
     agent = train.Agent(kind, 2, train.DEFAULTS)
     env = train.make_env("push", 2, train.DEFAULTS)
-    obs = as_batch([env.reset(seed=seed)[0] for seed in range(4)])
+    obs = observations(env, count=4)
     env.close()
     with torch.no_grad():
         torch.testing.assert_close(reweigh.reweighed_z(agent, obs), agent.encode(obs),
                                    atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["lrn", "attn"])
+def test_reweighed_distractors_count_as_two_of_five(kind, results_scripts):
+    """Trained at 2, played at 5, term by term. (Pairs of RN: two tests further down.)"""
+    import reweigh
+
+    agent = train.Agent(kind, 2, train.DEFAULTS)
+    env = train.make_env("push", 5, train.DEFAULTS)
+    obs = observations(env, count=4)
+    env.close()
+    encoder, (objects, goal) = agent.encoder, agent.tokens(obs)
+    terms = encoder.relations(objects, goal) if kind == "lrn" else encoder.attend(objects, goal)[0]
+    z = reweigh.reweighed_z(agent, obs)
+    for b in range(4):
+        total = torch.zeros(D)
+        for i, term in enumerate(terms[b]):
+            is_distractor = i < 6 and obs["cubes"][b, i, -1] != obs["goal"][b, -1]
+            total = total + term * (2 / 5 if is_distractor else 1)
+        same(z[b], z_slow(encoder, total))
 
 
 @pytest.mark.parametrize("kind, layer_norm, reason", [
@@ -3372,9 +3448,9 @@ def test_what_is_no_sum_is_not_reweighed(kind, layer_norm, reason, results_scrip
     agent = train.Agent(kind, 2, {**train.DEFAULTS, "layer_norm": layer_norm})
     monkeypatch.setattr(reweigh, "load", lambda run: ({}, agent))
     monkeypatch.setattr(sys, "argv", ["reweigh.py", "run"])
-    with pytest.raises(SystemExit):
+    with pytest.raises(SystemExit) as end:
         reweigh.main()
-    assert reason in capsys.readouterr().err
+    assert end.value.code == 2 and reason in capsys.readouterr().err
 
 
 def test_reweighed_pairs_weigh_as_much_as_in_training(results_scripts):
@@ -3443,13 +3519,13 @@ def test_a_curve_of_a_short_run_is_its_mean(results_scripts):
 
 def test_screened_encoders_pool_as_their_formulas_say(results_scripts):
     import screen
-    objects, goal = torch.randn(2, 6, 64), torch.randn(2, 64)
+    objects, goal = some(2, 6)
     gated, softmax, alone = screen.LRNGated(), screen.LRNSoftmax(), screen.LRNAlone()
     for b in range(2):
         total = torch.zeros(64)
         for r in gated.relations(objects, goal)[b]:
             total += r / (1 + math.exp(-r[0].item()))
-        torch.testing.assert_close(gated(objects, goal)[b], gated.norm(gated.f(total)))
+        same(gated(objects, goal)[b], gated.norm(gated.f(total)))
 
         asked = softmax.query.weight @ goal[b] + softmax.query.bias
         relations = softmax.relations(objects, goal)[b]
@@ -3485,6 +3561,59 @@ def test_a_thrown_cube_is_told_from_a_pushed_one(results_scripts):
     way = math.sqrt(0.07 ** 2 + 0.07 ** 2 + 0.01 ** 2)
     speed = (0.06 + 0.01 + way) / (4 * 0.04)
     np.testing.assert_allclose(watched.row(), (speed, 2 / 4, 2 / 4, 0.5))
+
+
+def test_phases_of_an_episode_by_hand(results_scripts):
+    """Reached, then raised while one tip is off, then carried to the goal and past it."""
+    import phases
+
+    class Lifting:
+        goal = ((0.1, 0.0, 0.12), None)
+        rho = iter([0.0, 0.0, 0.9, 0.6])
+        moments = iter([((0.0, 0.0, 0.03), 0.05), ((0.0, 0.0, 0.06), 0.07),
+                        ((0.09, 0.01, 0.12), 0.07), ((0.1, 0.0, 0.15), 0.07)])
+
+        def step(self, action):
+            place, away = next(self.moments)
+            x, y, z = place
+            tips = [(x + 0.05, y, z), (x, y + 0.05, z), (x, y, z + away)]
+            self._moment = SimpleNamespace(position=place, tips=tips)
+            return None, 0.0, False, False, {"fractional_success": next(self.rho),
+                                             "fractional_success_strict": 0.5}
+
+    watched = phases.Watched(Lifting())
+    seen = []
+    for _ in range(4):
+        watched.step(None)
+        seen.append([watched.row[name] for name in ("reached", "raised", "above", "placed", "kept",
+                                                    "best", "success")])
+    assert seen == [[1, 0, 0, 0, 0, 0.0, 0.0], [1, 1, 0, 0, 0, 0.0, 0.0],
+                    [1, 1, 1, 1, 1, 0.9, 0.9], [1, 1, 1, 1, 0, 0.9, 0.6]]
+    assert watched.row["strict"] == 0.5 and watched.height == 0.12
+
+
+def test_figure_8_is_the_norm_of_every_kind_of_relation(results_scripts, monkeypatch):
+    """Relations of known length stand in for those of the agent: 1, 2, 3, 4, then distractors."""
+    import inside
+
+    def record(run, N, episodes, seen):
+        assert len(episodes) == 3
+        lengths = torch.tensor([1.0, 2.0, 3.0, 4.0] + [10.0 * (i + 1) for i in range(N)])
+        r = torch.zeros(2, 3, 4 + N, D)                        # 2 steps, 3 episodes
+        r[..., 7] = lengths
+        r[1] *= 2
+        return r.numpy()
+
+    written = []
+    monkeypatch.setattr(inside, "record", record)
+    monkeypatch.setattr(inside, "write", lambda *given: written.append(given))
+    inside.figure_8(range(3))
+    (name, columns, rows), = written
+    assert name == "figure8.csv"
+    assert columns == ("N", "step", "finger 0", "finger 1", "finger 2", "target", "distractors")
+    lengths = {4: (1, 2, 3, 4, 25), 5: (1, 2, 3, 4, 30)}
+    assert [(N, step, *map(float, values)) for N, step, *values in rows] == [
+        (N, step, *(step * length for length in lengths[N])) for N in (4, 5) for step in (1, 2)]
 
 
 def test_a_probe_reads_what_z_holds_and_nothing_else(results_scripts):
@@ -3591,13 +3720,16 @@ def test_all_figures_are_drawn(tmp_path):
     assert len(lines) == 7 and all(line.startswith("wrote ") for line in lines)
 
 
-def table_rows(text):
-    return [line for line in text.splitlines() if line.startswith("|")]
+def table_rows(text, head="|"):
+    """All rows of the Markdown tables whose first row starts so."""
+    tables = re.findall(r"(?:^\|.*\n?)+", text, flags=re.MULTILINE)
+    return [row for table in tables if table.startswith(head) for row in table.splitlines()]
 
 
 def test_tables_of_the_notebook_are_those_of_the_files():
     with open(os.path.join(HERE, "results", "README.md")) as file:
-        notebook = table_rows(file.read())
+        text = file.read()
+    notebook = table_rows(text)
     done = run("results/figures.py", "table")
     assert done.returncode == 0, done.stderr
     with open(os.path.join(HERE, "results", "tables.md")) as file:
@@ -3606,6 +3738,8 @@ def test_tables_of_the_notebook_are_those_of_the_files():
     for printed in done.stdout.split("\n\n"):
         if not printed.startswith(("| strict", "| solved")):
             assert set(table_rows(printed)) <= set(notebook)
+    for head in ("| in training |", "| axis-aligned |"):       # and no rows of runs that are gone
+        assert set(table_rows(text, head)) <= set(table_rows(done.stdout, head))
     searched = run("results/search.py")
     assert searched.returncode == 0, searched.stderr
     assert len(table_rows(searched.stdout)) > 10
@@ -3651,9 +3785,9 @@ def test_a_shipped_run_has_the_same_weights_and_no_optimiser(trained, tmp_path, 
         ship.ship(trained, str(tmp_path / "shipped"))
 
 
-def reproduce(*words, cwd=HERE):
+def reproduce(*words, cwd=HERE, env=None):
     return subprocess.run(["bash", "results/reproduce.sh", *words], cwd=cwd, capture_output=True,
-                          text=True)
+                          text=True, env=env)
 
 
 def test_every_shipped_run_has_its_command():
@@ -3675,6 +3809,25 @@ def test_every_shipped_run_has_its_command():
         assert (words[0] == "done") == is_shipped, name
     shipped = [name for name in os.listdir(os.path.join(HERE, "results")) if "-seed" in name]
     assert shipped and set(shipped) <= set(names)
+    for name in shipped:                                       # the present code can play it
+        checkpoint, _ = train.load(os.path.join(HERE, "results", name))
+        task, encoder = checkpoint["task"], checkpoint["encoder"]
+        assert name.startswith(f"{task}-{encoder}-n{checkpoint['distractors']}-")
+
+
+def test_scores_of_the_readme_are_those_of_the_files():
+    with open(os.path.join(HERE, "README.md")) as file:
+        rows = table_rows(file.read(), "| N |")
+    groups = {"PushingCube, LRN": "push-lrn-n2", "PushingCube, LRN-max": "push-lrn-max-n2",
+              "LiftingCube, LRN": "lift-lrn-n2"}
+    for label, group in groups.items():
+        runs = sorted(glob.glob(os.path.join(HERE, "results", f"{group}-seed?", "zeroshot.csv")))
+        of_seeds = [{row["distractors"]: row["success_aabb"] for row in read_csv(path)}
+                    for path in runs]
+        cells = [", ".join(f"{scores[n]:.2f}".removeprefix("0") for scores in of_seeds)
+                 for n in (0, 2, 5, 9, 14)]
+        assert f"| {label} | {' | '.join(cells)} |" in rows
+    assert rows[0] == "| N | 0 | 2 | 5 | 9 | 14 |" and len(rows) == 2 + len(groups)
 
 
 def test_reproduce_lists_what_a_pattern_names_and_refuses_unknown_options():
@@ -3684,6 +3837,26 @@ def test_reproduce_lists_what_a_pattern_names_and_refuses_unknown_options():
                   ["--jobs", "many"]):
         refused = reproduce(*words)
         assert refused.returncode == 2 and len(refused.stderr.splitlines()) == 1, words
+
+
+@pytest.mark.parametrize("name, arguments, numbers", [
+    ("push-mlp-n1-seed0", "--task push --encoder mlp --distractors 1 --seed 0", "1"),
+    ("push-rn-n1-seed0", "--task push --encoder rn --distractors 1 --seed 0", "0-9"),
+    ("lift-rn-n2-seed1", "--task lift --encoder rn --distractors 2 --seed 1", "0-9,14,19")])
+def test_reproduce_trains_evaluates_and_ships_a_run(name, arguments, numbers, tmp_path):
+    """Instead of python a script that notes what it is asked for."""
+    (tmp_path / "results").mkdir()
+    shutil.copy(os.path.join(HERE, "results", "reproduce.sh"), tmp_path / "results")
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\necho \"$@\" >> calls\n")
+    python.chmod(0o755)
+    done = reproduce(f"^{name}$", cwd=tmp_path,
+                     env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"})
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "calls").read_text().splitlines() == [
+        f"train.py {arguments} --ranks 1 --out runs/{name}",
+        f"evaluate.py runs/{name} --distractors {numbers} --save",
+        f"results/ship.py runs/{name}"]
 
 
 def test_reproduce_does_not_take_a_run_of_somebody_else_for_its_own(tmp_path):
@@ -3706,16 +3879,16 @@ def test_a_recentred_lrn_is_the_same_at_its_n_and_ignores_constant_distractors(r
     encoder = agent.encoder
     torch.nn.init.normal_(encoder.g[5].bias)
     torch.nn.init.normal_(encoder.f.bias)
-    objects, goal = torch.randn(4, 6, 64), torch.randn(4, 64)
+    objects, goal = some(4, 6)
     copies = objects[:, :1].expand(-1, 3, -1)                  # three more of the first object
     with torch.no_grad():
         before = encoder(objects, goal)
         c = encoder.relations(objects[:1], goal[:1])[0, 0]     # what scene 0's first object adds
         weights = {f"agent.{name}": value for name, value in agent.state_dict().items()}
         recentre.recentre(weights, c, 6)
-        torch.testing.assert_close(encoder(objects, goal), before, atol=1e-5, rtol=1e-4)
+        same(encoder(objects, goal), before)
         more = encoder(torch.cat([objects, copies], dim=1), goal)
-    torch.testing.assert_close(more[0], before[0], atol=1e-5, rtol=1e-4)
+    same(more[0], before[0])
     assert (more[1] - before[1]).abs().max() > 0.1             # there c is not what the first adds
 
 
