@@ -4284,6 +4284,13 @@ MUTATIONS = {
     ),
     "train.py": (
         # Files
+        ("self.update, self.seconds = checkpoint[\"update\"], checkpoint[\"seconds\"]",
+         "self.update = checkpoint[\"update\"]",
+         "test_a_stop_in_the_middle_of_an_update_goes_back_to_its_beginning"),
+        ("TIMING, self.update)", "TIMING, 9 ** 9)",
+         "test_stopped_killed_and_resumed_equals_never_stopped"),
+        ("mlp(width, 2 * hidden, 2 * hidden, z_dim)", "mlp(width, z_dim)",
+         "test_mlp_agent_sees_everything_and_has_a_fixed_input"),
         ("return checkpoint, agent.eval()", "return checkpoint, agent",
          "test_a_shipped_run_has_the_same_weights_and_no_optimiser"),
         ("len(os.sched_getaffinity(0))", "os.cpu_count()",
@@ -4413,6 +4420,12 @@ MUTATIONS = {
          "test_of_two_ranks_one_says_that_a_gradient_is_not_finite"),
     ),
     "evaluate.py": (
+        ("blocked=blocked[e]", "blocked=False",
+         "test_an_episode_that_ends_for_another_reason_is_cut_short"),
+        ("args.distractors or \"0-9\"", "args.distractors or \"0-8\"",
+         "test_commands_without_options_mean_what_the_readme_says"),
+        ("        print(\"the window was closed\")", "        raise",
+         "test_closing_the_window_ends_watching"),
         ("play_all(folder, numbers,", "play_all(run, numbers,",
          "test_a_run_that_trains_on_meanwhile_does_not_change_what_is_evaluated"),
         ("derived_seed(EVALUATION, episode, STARTS)", "derived_seed(EVALUATION, 0, STARTS)",
