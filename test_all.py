@@ -3609,7 +3609,8 @@ def test_figure_8_is_the_norm_of_every_kind_of_relation(results_scripts, monkeyp
     written = []
     monkeypatch.setattr(inside, "record", record)
     monkeypatch.setattr(inside, "write", lambda *given: written.append(given))
-    inside.figure_8(range(3))
+    monkeypatch.setattr(sys, "argv", ["inside.py", "8", "--episodes", "3"])
+    inside.main()
     (name, columns, rows), = written
     assert name == "figure8.csv"
     assert columns == ("N", "step", "finger 0", "finger 1", "finger 2", "target", "distractors")
@@ -3786,6 +3787,21 @@ def test_a_shipped_run_has_the_same_weights_and_no_optimiser(trained, tmp_path, 
         ship.ship(trained, str(tmp_path / "shipped"))
 
 
+def test_curves_are_shipped_alone_if_asked_for(trained, tmp_path, results_scripts, monkeypatch,
+                                               capsys):
+    import ship
+
+    monkeypatch.setattr(sys, "argv", ["ship.py", "--curves", str(tmp_path / "curves"), trained])
+    ship.main()
+    assert os.listdir(tmp_path / "curves") == ["lrn.csv"]      # `trained` is a folder "lrn"
+    assert read_csv(tmp_path / "curves" / "lrn.csv") == read_csv(f"{trained}/progress.csv")
+    monkeypatch.setattr(sys, "argv", ["ship.py", str(tmp_path / "nowhere")])
+    with pytest.raises(SystemExit) as stopped:
+        ship.main()
+    assert stopped.value.code == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
 def reproduce(*words, cwd=HERE, env=None):
     return subprocess.run(["bash", "results/reproduce.sh", *words], cwd=cwd, capture_output=True,
                           text=True, env=env)
@@ -3893,7 +3909,7 @@ def test_a_recentred_lrn_is_the_same_at_its_n_and_ignores_constant_distractors(r
 
 
 def test_recentring_a_run_is_measured_in_other_episodes_and_overwrites_nothing(
-        trained, tmp_path, results_scripts, monkeypatch):
+        trained, tmp_path, results_scripts, monkeypatch, capsys):
     """What distractors add is zero on the average afterwards, in the episodes that were played."""
     import recentre
 
@@ -3903,7 +3919,10 @@ def test_recentring_a_run_is_measured_in_other_episodes_and_overwrites_nothing(
     (tmp_path / "run").mkdir()
     train.save(checkpoint, str(tmp_path / "run" / "checkpoint.pt"))
     before = recentre.mean_distractor(str(tmp_path / "run"), 2, 2)
-    recentre.write_recentred(str(tmp_path / "run"), str(tmp_path / "out"), 2)
+    words = ["recentre.py", str(tmp_path / "run"), str(tmp_path / "out"), "--episodes", "2"]
+    monkeypatch.setattr(sys, "argv", words)
+    recentre.main()
+    assert f"a vector of length {before.norm():.2f}" in capsys.readouterr().out
     # The agent acts as before, so it plays the same episodes.
     after = recentre.mean_distractor(str(tmp_path / "out"), 2, 2)
     assert after.norm() < 1e-3 * before.norm()
