@@ -3519,6 +3519,17 @@ def test_a_curve_of_a_short_run_is_its_mean(results_scripts):
     assert frames.tolist() == [0.016] and means == pytest.approx([0.3])
 
 
+def test_a_row_counts_for_each_update_that_it_stands_for(results_scripts):
+    """Rows for the updates 1 to 10, 11 to 30, 31 to 35; the last 25 are 6 to 30 and 11 to 35."""
+    import figures
+
+    rows = {"update": np.array([10.0, 30.0, 35.0]), "frames": np.array([1e6, 3e6, 3.5e6]),
+            "score": np.array([0.0, 0.5, 1.0])}
+    frames, means = figures.smooth(rows, "score", window=25)
+    assert frames.tolist() == [3.0, 3.5]
+    np.testing.assert_allclose(means, [20 * 0.5 / 25, (20 * 0.5 + 5 * 1.0) / 25])
+
+
 def test_screened_encoders_pool_as_their_formulas_say(results_scripts):
     import screen
     objects, goal = some(2, 6)
@@ -3830,6 +3841,25 @@ def test_every_shipped_run_has_its_command():
         checkpoint, _ = train.load(os.path.join(HERE, "results", name))
         task, encoder = checkpoint["task"], checkpoint["encoder"]
         assert name.startswith(f"{task}-{encoder}-n{checkpoint['distractors']}-")
+
+
+def test_what_we_added_is_the_success_in_training_of_the_runs(results_scripts):
+    import figures
+
+    text = read(os.path.join(HERE, "results", "README.md")).decode()
+    rows = [[cell.strip() for cell in row.split("|")[1:-1]]
+            for row in table_rows(text, "| without | instead |")]
+    *whats, run_column = rows[0]
+    assert whats == ["without", "instead", "1 M", "1.6 M", "2 M", "3 M"] and run_column == "run"
+    checked = 0
+    for *_, at_1, at_16, at_2, at_3, name in rows[2:]:
+        if not name.startswith("push-"):                       # a curve of the search alone
+            continue
+        frames, success = figures.training_success(os.path.join(HERE, "results", name))
+        found = [f"{success[frames < millions + 1e-9][-1]:.2f}" for millions in (1, 1.6, 2, 3)]
+        assert [at_1, at_16, at_2, at_3] == found, name
+        checked += 1
+    assert checked >= 15
 
 
 def test_scores_of_the_readme_are_those_of_the_files():

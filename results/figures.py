@@ -260,14 +260,17 @@ def pyplot():
 
 
 def smooth(rows, name, window=WINDOW):
-    """Frames in millions, and means of a column over `window` updates.
+    """Frames in millions, and means of a column over the last `window` updates (or all of them).
 
-    A row may stand for several updates (ship.py).
+    A row may stand for several updates (ship.py): it counts for each of them.
     """
-    rows_a_window = round(window * len(rows["update"]) / rows["update"][-1])
-    count = min(max(rows_a_window, 1), len(rows["update"]))    # a run may be shorter than that
-    means = np.convolve(rows[name], np.ones(count) / count, "valid")
-    return rows["frames"][count - 1:] / 1e6, means
+    updates = np.concatenate([[0], rows["update"]])
+    total = np.concatenate([[0], np.cumsum(rows[name] * np.diff(updates))])
+    window = min(window, updates[-1])                          # a run may be shorter than that
+    has_window = rows["update"] >= window
+    ends = rows["update"][has_window]
+    sums = np.interp(ends, updates, total) - np.interp(ends - window, updates, total)
+    return rows["frames"][has_window] / 1e6, sums / window
 
 
 def draw(axes, x, curves, label, color, marker=None):
