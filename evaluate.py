@@ -7,11 +7,12 @@
     python evaluate.py RUN --gif push.gif --distractors 9    a film of one episode
 
 Episode j starts from the same seed at every N and for every agent: goal, target cube and the first
-distractors stand in the same places (unless a crowd has to be nudged, or an agent was trained with
-another goal_yaw). What is drawn after them differs: identifiers, the target's row and a lifting
-goal's height. The seeds belong to no training run (but one with --seed 20220131). The paper does
-not say whether its scores are of sampled actions or of the policy's means; CausalWorld's evaluation
-plays the means, and so do we. results/README.md explains the table's columns ("Words").
+distractors stand in the same places (unless a crowd has to be nudged, as in nearly all episodes at
+N = 14, or an agent was trained with another goal_yaw). What is drawn after them differs:
+identifiers, the target's row and a lifting goal's height. The seeds belong to no training run (but
+one with --seed 20220131). The paper does not say whether its scores are of sampled actions or of
+the policy's means; CausalWorld's evaluation plays the means, and so do we. results/README.md
+explains the table's columns ("Words").
 """
 import argparse
 import csv
@@ -28,7 +29,7 @@ import pybullet
 import torch
 
 from train import STOPPED, checkpoint_file, cores, derived_seed, fail, load, make_env, positive
-from trifinger_env import (CUBE, DIVERGED, IDENTIFIER, IDENTIFIERS, POSITION, POSITION_SCALE,
+from trifinger_env import (CUBE, DIVERGED, IDENTIFIER, IDENTIFIER_POOL, POSITION, POSITION_SCALE,
                            SOLVED, TIME)
 
 COLUMNS = ("distractors", "episodes", "success_aabb", "success_strict", "ci95", "ci95_strict",
@@ -65,11 +66,11 @@ def is_blocked(obs):
     target = is_target(obs)
     places = obs["cubes"][:, POSITION][:, :2] * POSITION_SCALE             # (N+1, 2), m
     goal = obs["goal"][POSITION][:2] * POSITION_SCALE
-    start, others = places[target][0], places[~target]
-    way = goal - start
+    cube, others = places[target][0], places[~target]
+    way = goal - cube
     length_squared = max(np.square(way).sum(), 1e-12)
-    share = np.clip((others - start) @ way / length_squared, 0, 1)         # of the way, (N,)
-    nearest = start + share[:, None] * way                                 # (N, 2)
+    share = np.clip((others - cube) @ way / length_squared, 0, 1)          # of the way, (N,)
+    nearest = cube + share[:, None] * way                                  # (N, 2)
     return bool((np.linalg.norm(others - nearest, axis=1) < CUBE).any())
 
 
@@ -383,7 +384,7 @@ def parse_range(text):
             first, last = int(low), int(high or low)
             if last < first:
                 raise ValueError
-            last = min(last, first + len(IDENTIFIERS))         # 0-999999999 must not fill memory
+            last = min(last, first + len(IDENTIFIER_POOL))     # 0-999999999 must not fill memory
             numbers.update(range(first, last + 1))
     except ValueError:
         fail(f"--distractors must look like 0-9 or 0,2,5, got {text!r}")
@@ -397,7 +398,8 @@ def read_command():
     add = parser.add_argument
     add("runs", nargs="+", metavar="RUN", help="run folder of train.py")
     add("--distractors", metavar="LIST",
-        help="numbers of distractors, as 0-9 or 0,2,14 (default 0-9; to watch: as trained)")
+        help="numbers of distractors, as 0-9 or 0,2,14 (default 0-9); to watch or film: "
+             "the smallest of them (default: as trained)")
     add("--episodes", type=positive, default=200, metavar="E",
         help="episodes at each N (default 200)")
     add("--sample-actions", action="store_true",

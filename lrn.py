@@ -99,6 +99,8 @@ class LRN(nn.Module):
         batch): False marks padding, and z is as if it were not there. ValueError for other shapes.
         """
         check_shapes(self.token_dim, objects, goal, present)
+        if present is not None:                                # NaN there would spoil gradients
+            objects = objects.masked_fill(~present[..., None], 0.0)
         r = self.relations(objects, goal)                      # (B, K, D), all g_theta(o_i, o_goal)
         pooled = self.pool(r, present)                         # (B, D), sum_i r_i
         return self.norm(self.f(pooled))                       # (B, Z), LayerNorm(f_phi(.))

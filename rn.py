@@ -75,6 +75,8 @@ class RN(nn.Module):
         batch): False marks padding, and z is as if it were not there. ValueError for other shapes.
         """
         check_shapes(self.token_dim, objects, goal, present)
+        if present is not None:                                # NaN there would spoil gradients
+            objects = objects.masked_fill(~present[..., None], 0.0)
         r = self.relations(objects, goal)                      # (B, K+1, K+1, D)
         if present is not None:
             real = pad(present, (0, 1), value=True)            # (B, K+1), the goal is real

@@ -233,6 +233,20 @@ def test_encoder_ignores_order_and_padding_and_serves_any_number(make):
 
 
 @every_encoder
+def test_padding_has_no_part_in_the_gradient(make):
+    encoder = shaken(make())
+    objects, goal = some(2, 6)
+    encoder(objects, goal).square().sum().backward()
+    expected = [p.grad.clone() for p in encoder.parameters()]
+    encoder.zero_grad()
+    padding = torch.full((2, 3, D), math.nan)
+    present = torch.arange(9).expand(2, -1) < 6
+    encoder(torch.cat([objects, padding], dim=1), goal, present).square().sum().backward()
+    for p, gradient in zip(encoder.parameters(), expected):
+        torch.testing.assert_close(p.grad, gradient, atol=1e-4, rtol=1e-4)
+
+
+@every_encoder
 def test_padding_may_differ_between_the_samples_of_a_batch(make):
     encoder = shaken(make())
     objects, goal = some(3, 6)
@@ -1258,6 +1272,7 @@ def test_soak(n, task, kind):
     ({"action_scale": 0.0}, "positive"),
     ({"cube_mass": -0.08}, "positive"),
     ({"finger_friction": float("nan")}, "positive"),
+    ({"goal_yaw": -0.1}, "goal_yaw"), ({"goal_yaw": float("nan")}, "goal_yaw"),
     ({"render_mode": "ascii"}, "render_mode"),
 ])
 def test_bad_arguments_are_refused(arguments, words):
@@ -2619,6 +2634,28 @@ def test_scores_go_when_the_weights_they_are_of_are_replaced(tmp_path, command, 
     assert len(read_csv(out / "progress.csv")) == 3 and not os.path.exists(out / "zeroshot.csv")
 
 
+def test_a_stop_before_anything_was_learned_keeps_the_scores(trained, tmp_path, command,
+                                                             monkeypatch):
+    """Ctrl-C comes in the first rollout after --resume."""
+    def stop(learner, seeds):
+        raise KeyboardInterrupt
+
+    def leave(ranks, stopped):
+        assert ranks == 1 and stopped
+        raise SystemExit(train.STOPPED)
+
+    out = tmp_path / "run"
+    shutil.copytree(trained, out)
+    (out / "zeroshot.csv").write_text("of these weights")
+    save_changed(trained, out, {"ranks": 1}, frames=10 ** 6)
+    before = files_below(out)
+    monkeypatch.setattr(PPO, "rollout", stop)
+    monkeypatch.setattr(train, "leave_ranks", leave)
+    with pytest.raises(SystemExit):
+        command("train.py --resume --distractors 0 --out", out)
+    assert files_below(out) == before
+
+
 def test_resuming_a_finished_run_changes_nothing(trained, tmp_path, command, capsys):
     out = tmp_path / "run"
     shutil.copytree(trained, out)
@@ -2771,6 +2808,8 @@ BAD_INPUT = {                            # start of the command: ((its end, word
         ("--ranks 0", "--ranks"),
         ("--ranks 3", "--ranks"),
         ("--save-minutes soon", "--save-minutes"),
+        ("--save-minutes nan", "--save-minutes"),
+        ("--save-minutes -1", "--save-minutes"),
         ("--speed 3", "--speed"),
         ("--resume", "new"),
         ("--resume --overwrite", "--overwrite"),
@@ -2782,6 +2821,8 @@ BAD_INPUT = {                            # start of the command: ((its end, word
         ("--set lr=-1", "lr"),
         ("--set lr=nan", "lr"),
         ("--set log_std=inf", "log_std"),
+        ("--set discount=1.01", "discount=1.01: expected a number from 0 to 1"),
+        ("--set lam=2", "lam=2: expected a number from 0 to 1"),
         ("--set minibatches=7", "minibatches"),
         ("--set episode_steps=126", "never see the end of an episode"),
         ("--set z_dim=7 --set joy=1", "joy"),

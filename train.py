@@ -36,7 +36,7 @@ from lrn import LRN, LRNMax, orthogonal
 from ppo import PPO
 from rn import RN
 from trifinger_env import (CUBE_WIDTH, FINGER_WIDTH, FINGERTIP, GOAL_WIDTH, IDENTIFIER,
-                           IDENTIFIERS, LINEAR, POSITION, SOLVED, TIME, TriFingerEnv)
+                           IDENTIFIER_POOL, LINEAR, POSITION, SOLVED, TIME, TriFingerEnv)
 
 
 class Setting(NamedTuple):
@@ -60,7 +60,7 @@ SETTINGS = {
     "action_scale": Setting(0.1, 0.1, "rad, largest step of an action"),
     "cube_mass": Setting(0.08, 0.02, "kg; CW's pushing and picking tasks: 0.02"),
     "finger_friction": Setting(1.0, 0.1, "IsaacGymEnvs; CW: 0.1, which holds no 0.08 kg"),
-    "goal_yaw": Setting(0.0, math.pi / 4, "rad, largest; 0: place alone (4.1: a pose; CW: any)"),
+    "goal_yaw": Setting(0.0, math.pi / 4, "rad, largest; 0: only the place counts (4.1: a pose)"),
     "reward_overlap": Setting(100.0, 100.0, "alpha_1 (A.1)"),
     "reward_distance": Setting(5000.0, 250.0, "alpha_2 (A.1): 2 mm are worth 0.5; CW: 2500"),
     "reward_curiosity": Setting(0.0, 10.0, "alpha_3 (A.1): a penalty, smaller for a fast cube"),
@@ -88,7 +88,7 @@ SETTINGS = {
     "heads": Setting(4, 4, "of ATTN; not printed: a guess"),
     "relations": Setting(True, True, "False: LRN without relations (figure 5)"),
     "layer_norm": Setting(True, True, "False: LRN with a mean instead (figure 5)"),
-    "log_std": Setting(-0.7, 0.0, "of the actions, at the start; rlpyt: 0. -1 learns later"),
+    "log_std": Setting(-0.7, 0.0, "log std of actions at the start; rlpyt: 0; -1 learns later"),
 }
 # LiftingCube takes longer, most of its score comes while the learning rate is small, and noise
 # costs it more.
@@ -107,7 +107,7 @@ TIMING = ("update", "frames", "seconds", "frames_per_second", "rollout_share")
 
 # ---- the agent
 
-POOL = torch.tensor(IDENTIFIERS, dtype=torch.float32)
+POOL = torch.tensor(IDENTIFIER_POOL, dtype=torch.float32)
 FACTS = 3 + 3 + 3 + 9                    # what the read-out reads from z, see Agent.auxiliary
 
 
@@ -320,6 +320,7 @@ class Run:
         self.frames_per_update = settings["envs"] * settings["steps"]
         self.last_update = math.ceil(settings["frames"] / self.frames_per_update)
         self.saved_at = time.monotonic()
+        self.saved_update = None         # that of the checkpoint in the folder
 
     def path(self, name):
         return os.path.join(self.args.out, name)
@@ -330,6 +331,7 @@ class Run:
         self.learner.load_state_dict(checkpoint["learner"])
         self.learner.optimizer.load_state_dict(checkpoint["optimizer"])
         self.update, self.seconds = checkpoint["update"], checkpoint["seconds"]
+        self.saved_update = self.update
 
     def checkpoint(self):
         """All that is needed to go on. The random state of a run is its seed and its update."""
@@ -349,11 +351,13 @@ class Run:
 
     def save(self, checkpoint):
         """Replace the run's checkpoint, and remove scores: they are of the weights before."""
+        if checkpoint["update"] == self.saved_update:          # stopped before anything was learned
+            return
         for name in ("zeroshot.csv", "zeroshot-sampled.csv"):
             if os.path.exists(self.path(name)):
                 os.remove(self.path(name))
         save(checkpoint, self.path("checkpoint.pt"))
-        self.saved_at = time.monotonic()
+        self.saved_at, self.saved_update = time.monotonic(), checkpoint["update"]
 
     def open_files(self):
         """Make the folder ready: a run can be resumed from its first moment on."""
@@ -548,6 +552,14 @@ def positive(text):
     return number
 
 
+def minutes(text):
+    """A number >= 0, as argparse's `type`."""
+    number = float(text)
+    if not 0 <= number < math.inf:
+        raise ValueError
+    return number
+
+
 def read_command(argv=None):
     """The command's arguments, with the run folder and torchrun's ranks filled in."""
     parser = argparse.ArgumentParser(
@@ -573,8 +585,9 @@ def read_command(argv=None):
     add("--resume", action="store_true", help="go on from the run folder's checkpoint")
     add("--overwrite", action="store_true", help="start anew in a folder that holds a run")
     add("--ranks", type=int, metavar="R",
-        help="processes, ignored under torchrun (default one per core, if they divide the batch)")
-    add("--save-minutes", type=float, default=3.0, metavar="M",
+        help="processes, ignored under torchrun (default one per core, or fewer if environments "
+             "and batch ask for it)")
+    add("--save-minutes", type=minutes, default=3.0, metavar="M",
         help="minutes between checkpoints (default 3)")
     args = parser.parse_args(argv)
     if args.out is None:
@@ -636,6 +649,8 @@ def read_value(name, text, where):
             fail(f"{where}: expected a finite number")
         if value < 0 and not may_be_negative:
             fail(f"{where}: expected a number >= 0")
+        if value > 1 and name in ("discount", "lam"):
+            fail(f"{where}: expected a number from 0 to 1")
     return value
 
 

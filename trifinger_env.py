@@ -36,7 +36,7 @@ CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multipli
 # paper's simulator) has 0.08 kg (0.02 in its pushing and picking tasks) and 0.1, with which a cube
 # can hardly be held (results/grasp.py); trifinger_simulation 0.08 kg and 0.5; IsaacGymEnvs 0.08 kg
 # and 1.0, as we do. A real cube weighs 0.094 kg.
-IDENTIFIERS = np.linspace(-1.0, 1.0, 21)                       # pool: none is new when N grows
+IDENTIFIER_POOL = np.linspace(-1.0, 1.0, 21)                   # none is new when N grows
 HIGHEST_GOAL = 0.2                       # height of the centre of the highest goal in lifting, m
 FIXED = 5                                # squares never nudged: three fingers, goal, target
 
@@ -374,6 +374,8 @@ class TriFingerEnv(Env):
                 raise ValueError("episode_steps and substeps must be positive integers")
         check_positive(timestep=timestep, action_scale=action_scale, cube_mass=cube_mass,
                        finger_friction=finger_friction)
+        if not 0 <= goal_yaw < math.inf:
+            raise ValueError(f"goal_yaw must be a finite number >= 0, got {goal_yaw!r}")
         self.task, self.distractors = task, int(distractors)
         self.episode_steps, self.substeps, self.timestep = episode_steps, substeps, timestep
         self.action_mode, self.action_scale = action_mode, action_scale
@@ -493,8 +495,8 @@ class TriFingerEnv(Env):
         """Draw poses (x, y, yaw) of goal, target and distractors, in this order: (N+2, 3).
 
         Goal and target come first, inside GRASP_RADIUS, so that their distribution is the same for
-        all N; distractors lie anywhere in the arena. All uniform by area; nothing overlaps, nothing
-        lies on the goal or touches a finger.
+        all N; distractors lie anywhere in the arena. All uniform by area (distractors until one has
+        to be nudged); nothing overlaps, nothing lies on the goal or touches a finger.
         """
         placed = [[*forward_kinematics(k, REST)[:2], 0.0, TIP_HALF_EDGE] for k in range(3)]
         self._add_square(placed, GRASP_RADIUS, self.goal_yaw)              # the goal
@@ -506,7 +508,8 @@ class TriFingerEnv(Env):
     def _add_square(self, placed, radius, yaw):
         """Add a free square to `placed`: rows x, y, yaw, half edge of 3 fingers, goal, target, ...
 
-        Where a crowd has jammed (N near 20), distractors are nudged until a gap opens.
+        Where a crowd has jammed, distractors are nudged until a gap opens: in some episodes from
+        N = 9 on, in nearly all at 14.
         """
         for _ in range(100_000):                               # a few, except in a crowd
             new = self._draw_squares(radius, yaw)
@@ -555,7 +558,7 @@ class TriFingerEnv(Env):
         goal, *cubes = self._place().tolist()
         count = len(cubes)
         self.target = int(self._np_random.integers(count))
-        self._ids = self._np_random.choice(IDENTIFIERS, count, replace=False).tolist()
+        self._ids = self._np_random.choice(IDENTIFIER_POOL, count, replace=False).tolist()
         height = CUBE / 2
         if self.task == "lift":
             height = float(self._np_random.uniform(CUBE / 2, HIGHEST_GOAL))
@@ -737,10 +740,13 @@ class TriFingerEnv(Env):
     def render(self, width=480, height=360):
         """RGB picture (height, width, 3) uint8 of the arena, drawn on the CPU; needs no screen.
 
-        RuntimeError without a render_mode, or if reset() has to come first.
+        With "human" None, as in Gymnasium: the window shows it. RuntimeError without a render_mode,
+        or if reset() has to come first.
         """
         if self._steps is None or not self.render_mode:
             raise RuntimeError("render() needs render_mode='rgb_array' and a reset() first")
+        if self.render_mode == "human":
+            return None
         # TinyRenderer knows no transparency: blend two pictures.
         with_goal = self._shot(width, height)
         self._show_goal([0, 0, -1])
@@ -765,7 +771,7 @@ class TriFingerEnv(Env):
 
 def check_arguments(task, distractors, action_mode, reward_weights, render_mode):
     """ValueError with one line if TriFingerEnv cannot be built from these."""
-    most = len(IDENTIFIERS) - 1
+    most = len(IDENTIFIER_POOL) - 1
     is_integer = isinstance(distractors, (int, np.integer)) and not isinstance(distractors, bool)
     unknown = set(reward_weights or {}) - set(REWARD_WEIGHTS)
     if task not in ("push", "lift"):

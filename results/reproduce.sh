@@ -85,7 +85,7 @@ all_runs() {
             a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
             a_run push lrn 2 $seed absolute --set action_mode=absolute
             a_run push lrn 2 $seed paperworld --set $paper_world $paper_reward
-            a_run push lrn 2 $seed paperworld-long --frames 8000000 --set $paper_world \
+            a_run push lrn 2 $seed paperworld-long --frames 6000000 --set $paper_world \
                 $paper_reward
             a_run push lrn 2 $seed paperworld-ppo --set $paper_world $paper_reward \
                 lr=2.5e-4 clip=0.5 anneal_clip=True epochs=4 minibatches=40 adam_eps=1e-8 \

@@ -17,7 +17,7 @@ import torch
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 import evaluate
 from train import fail, load, positive
-from trifinger_env import IDENTIFIERS
+from trifinger_env import IDENTIFIER_POOL
 
 
 def distractor_tokens(obs):
@@ -96,7 +96,7 @@ def main():
         description="Weigh distractors as in training (see the first lines of reweigh.py).")
     parser.error = fail
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folder of LRN, RN or ATTN")
-    parser.add_argument("--distractors", type=int, choices=range(len(IDENTIFIERS)), metavar="N",
+    parser.add_argument("--distractors", type=int, choices=range(len(IDENTIFIER_POOL)), metavar="N",
                         help="N (default 9; for a run trained at 9: 2)")
     parser.add_argument("--episodes", type=positive, default=100, metavar="E")
     args = parser.parse_args()
