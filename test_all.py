@@ -3404,7 +3404,7 @@ SCRIPTS = {                              # script: (arguments, words that it pri
     "reweigh.py": (["RUN", "--distractors", "1", "--episodes", "2"],
                    ["as it is", "distractors reweighed", "lengths: a distractor"]),
     "profile_training.py": (["--updates", "1"], ["ms a frame", "bare physics", "update"]),
-    "encoder_speed.py": (["--repeats", "1"], ["LRN: K=12", "RN: K=12", "slope"]),
+    "encoder_speed.py": (["--repeats", "1"], ["LRN: K=12", "ATTN: K=12", "RN: K=12", "slope"]),
     "grasp.py": (["--tries", "1"], ["0.08 kg | 0.00"]),
     "scripted_lift.py": (["--episodes", "2"], ["all | 2 | 1.00"]),
     "phases.py": (["RUN", "--distractors", "1", "--episodes", "2"],

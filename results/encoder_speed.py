@@ -1,4 +1,4 @@
-"""How long do LRN and RN take for K objects?
+"""How long do the encoders take for K objects?
 
     python results/encoder_speed.py                      forward and backward pass, a minute
     python results/encoder_speed.py --repeats 1
@@ -15,11 +15,13 @@ import numpy as np
 import torch
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+from attn import ATTN
 from lrn import LRN
 from rn import RN
 from train import fail, positive
 
 B, D = 64, 64
+NUMBERS = (12, 24, 48, 96, 192)          # K
 
 
 def milliseconds(encoder, K, repeats):
@@ -41,7 +43,7 @@ def main():
     args = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    for kind, numbers in {LRN: (12, 24, 48, 96, 192), RN: (12, 24, 48)}.items():
+    for kind, numbers in {LRN: NUMBERS, ATTN: NUMBERS, RN: NUMBERS[:3]}.items():
         times = [milliseconds(kind(), K, args.repeats) for K in numbers]
         slope, _ = np.polyfit(np.log(numbers), np.log(times), 1)
         shown = ", ".join(f"K={K} {ms:.2f} ms" for K, ms in zip(numbers, times))
