@@ -3754,6 +3754,7 @@ def test_every_table_stands_in_the_section_of_its_figure(results_scripts):
         "push-rn-n2-noreadout": "What we added",
         "push-lrn-n2-paper-25hz": "What we added",
         "push-lrn-n2-paperworld-ppo": "What we added",
+        "push-lrn-n2-papercontrol": "What we added",
         "push-attn-n2-noreadout-long": "What we added",
         "lift-lrn-n0": "How far does lifting come",
         "push-lrn-max-n9": "Beyond the paper",

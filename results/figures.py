@@ -65,8 +65,7 @@ SECTIONS = {                             # of the tables -> groups of runs; the 
     "Figure 4": "push-.*-n[013]$",
     "Figure 5": "-n2-(norelations|mean|z[0-9]+|no(overlap|distance|reach)|curiosity|"
                 "sparse|paperreward)$",
-    "What we added": "-(noreadout|rawvalues|rawadvantages|absolute|slippery|"
-                     "paper|paperworld)(-[a-z0-9]+)*$",
+    "What we added": "-(noreadout|rawvalues|rawadvantages|absolute|paper[a-z]*)(-[a-z0-9]+)*$",
     "How far does lifting come": "lift-.*-n0$",
     "Beyond the paper": "",
 }

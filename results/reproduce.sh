@@ -23,6 +23,8 @@ all_runs() {
     paper_reward="reward_distance=250 reward_reach=0 reward_curiosity=10"
     paper_cube="cube_mass=0.02 finger_friction=0.1"
     paper_world="action_mode=absolute $paper_cube goal_yaw=0.7854"
+    paper_control="substeps=3 timestep=0.004 episode_steps=2500 steps=2500 envs=2"
+    paper_ppo="lr=2.5e-4 clip=0.5 anneal_clip=True epochs=4 minibatches=40 adam_eps=1e-8 log_std=0"
     for seed in 0 1 2 3 4; do
         for encoder in lrn rn attn; do
             a_run push $encoder 2 $seed                        # figure 3, top
@@ -87,13 +89,17 @@ all_runs() {
             a_run push lrn 2 $seed paperworld --set $paper_world $paper_reward
             a_run push lrn 2 $seed paperworld-long --frames 6000000 --set $paper_world \
                 $paper_reward
-            a_run push lrn 2 $seed paperworld-ppo --set $paper_world $paper_reward \
-                lr=2.5e-4 clip=0.5 anneal_clip=True epochs=4 minibatches=40 adam_eps=1e-8 \
-                log_std=0
+            a_run push lrn 2 $seed paperworld-ppo --set $paper_world $paper_reward $paper_ppo
             a_run push lrn 2 $seed paperworld-std --set $paper_world $paper_reward log_std=0
             a_run push lrn 2 $seed paperworld-30s --set $paper_world $paper_reward \
-                substeps=3 timestep=0.004 episode_steps=2500 steps=2500 envs=2
-            a_run push lrn 2 $seed slippery --set $paper_cube $paper_reward
+                $paper_control
+            a_run push lrn 2 $seed paperworld-rawvalues --set $paper_world $paper_reward \
+                normalize_values=False
+            a_run push lrn 2 $seed paperworld-rawadvantages --set $paper_world $paper_reward \
+                normalize_advantages=False
+            a_run push lrn 2 $seed papercube --set $paper_cube goal_yaw=0.7854
+            a_run push lrn 2 $seed paperppo --set $paper_ppo
+            a_run push lrn 2 $seed papercontrol --set $paper_control
             a_run push lrn 2 $seed paper --paper                # the printed recipe, 60 M frames
             a_run push lrn 2 $seed paper-script --paper --set clip=0.2 reward_distance=2500 \
                 reward_reach=2500 reward_curiosity=0           # as CausalWorld's own script
