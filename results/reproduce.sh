@@ -63,6 +63,10 @@ all_runs() {
             done
             a_run push lrn-max 9 $seed                         # beyond the paper: 9 in training
             a_run push lrn 2 $seed noreadout --set auxiliary=0 # without our read-out loss
+            for encoder in lrn rn attn; do                     # our PPO and read-out, all else theirs
+                a_run push $encoder 2 $seed paperworld-long --frames 6000000 --set $paper_world \
+                    $paper_reward
+            done
         fi
         if [ $seed = 0 ]; then
             for encoder in rn attn; do
@@ -87,8 +91,6 @@ all_runs() {
             a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
             a_run push lrn 2 $seed absolute --set action_mode=absolute
             a_run push lrn 2 $seed paperworld --set $paper_world $paper_reward
-            a_run push lrn 2 $seed paperworld-long --frames 6000000 --set $paper_world \
-                $paper_reward
             a_run push lrn 2 $seed paperworld-ppo --set $paper_world $paper_reward $paper_ppo
             a_run push lrn 2 $seed paperworld-std --set $paper_world $paper_reward log_std=0
             a_run push lrn 2 $seed paperworld-30s --set $paper_world $paper_reward \
@@ -147,7 +149,7 @@ one_run() {
         exit 255                                               # xargs starts no other run then
     fi
     numbers=0-9
-    if [[ $name =~ -n[29]-seed ]]; then
+    if [[ $name =~ -n[29](-paperworld-long)?-seed ]]; then
         numbers=0-9,14,19                                      # figure 3, and beyond
     fi
     if [[ $name =~ -mlp-n([0-9]+) ]]; then
