@@ -63,7 +63,7 @@ all_runs() {
             done
             a_run push lrn-max 9 $seed                         # beyond the paper: 9 in training
             a_run push lrn 2 $seed noreadout --set auxiliary=0 # without our read-out loss
-            for encoder in lrn rn attn; do                     # our PPO and read-out, all else theirs
+            for encoder in lrn rn attn; do                     # the paper's world
                 a_run push $encoder 2 $seed paperworld-long --frames 6000000 --set $paper_world \
                     $paper_reward
             done
