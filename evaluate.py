@@ -11,8 +11,13 @@ distractors stand in the same places (unless a crowd has to be nudged, as in nea
 N = 14, or an agent was trained with another goal_yaw). What is drawn after them differs:
 identifiers, the target's row and a lifting goal's height. The seeds belong to no training run (but
 one with --seed 20220131). The paper does not say whether its scores are of sampled actions or of
-the policy's means; CausalWorld's evaluation plays the means, and so do we. results/README.md
-explains the table's columns ("Words").
+the policy's means; CausalWorld's evaluation plays the means, and so do we.
+
+The table's columns, means over episodes: success, axis-aligned as in CausalWorld and strict, by
+true volumes; solved, the share with 0.8 or more; cut short, how many ended before their time (a
+cube left, or the physics diverged); success where the way from target to goal was clear and where a
+distractor blocked it at the start; how far z at the start lies from where it lies at the N of
+training; how far the place that the read-out sees lies from the target cube.
 """
 import argparse
 import csv
@@ -177,9 +182,10 @@ def play(checkpoint, agent, distractors, episodes, sample_actions):
 
 def play_chunk(arguments):
     """play() in a process of its own, which has to load the agent anew."""
-    path, *rest = arguments
+    path, distractors, episodes, sample_actions = arguments
     torch.set_num_threads(1)
-    return play(*load(path), *rest)
+    checkpoint, agent = load(path)
+    return play(checkpoint, agent, distractors, episodes, sample_actions)
 
 
 # ---- the sweep over N
@@ -380,8 +386,8 @@ def parse_range(text):
     numbers = set()
     try:
         for part in text.split(","):
-            low, _, high = part.partition("-")
-            first, last = int(low), int(high or low)
+            low, dash, high = part.partition("-")
+            first, last = int(low), int(high if dash else low)
             if last < first:
                 raise ValueError
             last = min(last, first + len(IDENTIFIER_POOL))     # 0-999999999 must not fill memory

@@ -89,7 +89,7 @@ class LRN(nn.Module):
             return total
         if present is None:
             return total / r.shape[1]
-        count = present.sum(dim=1, keepdim=True).clamp(min=1)  # padding alone: 0, not NaN
+        count = present.sum(dim=1, keepdim=True).clamp(min=1)  # a row of padding: 0, not NaN
         return total / count
 
     def forward(self, objects, goal, present=None):
@@ -109,8 +109,9 @@ class LRN(nn.Module):
 class LRNMax(LRN):
     """Not the paper's: LRN with the largest r_i in each dimension in place of their sum.
 
-    Ten distractors whose relations r_i are equal then change z exactly as one of them would, which
-    a sum has to learn. Needs at least one real object in every row.
+    Ten distractors whose relations r_i are equal then change z exactly as one of them would; after
+    a sum, the rest of the network has to make up for the other nine. Needs at least one real object
+    in every row.
     """
 
     def __init__(self, token_dim=64, z_dim=25):                # without the paper's ablations

@@ -7,7 +7,9 @@
 
 For dict observations and continuous actions. All it asks of a network is
 `agent(obs) -> (mean (n, A), log_std (A,), value (n,))` for any number n of observations, where
-log_std is a parameter, the same for all; of an environment, Gymnasium's reset and step.
+log_std is a parameter, the same for all (and `agent.auxiliary(obs)`, a loss, if c_a > 0); of an
+environment, Gymnasium's reset and step. Actions are samples of a Gaussian, which the environment
+has to clip. Every rollout starts with fresh episodes, so T must be at least an episode's length.
 A rank is one of the processes that train together: each steps its own environments, and they
 average gradients and the moments of advantages and returns over torch.distributed (as DD-PPO
 does), so many ranks give the gradient of one on the joined minibatch.
@@ -84,11 +86,11 @@ class PPO(nn.Module):
     envs                   E environments of this rank
     steps                  T steps of a rollout; a batch is T * E samples
     minibatches, epochs    the batch is cut into equal parts and passed over `epochs` times;
-                           ValueError if it does not divide
+                           ValueError unless `minibatches` divides T * E
     lam                    GAE's lambda
     entropy, value_coef    coefficients of the loss
     lr_power               the learning rate falls as lr x (share of training left) ^ lr_power:
-                           1 in a line, 0 not at all
+                           1 linearly, 0 not at all
     anneal_clip            multiply the clip range by the share of training left
     normalize_advantages   to mean 0 and standard deviation 1 over the whole batch of all ranks
     normalize_values       the value network learns (return - running mean) / running std
@@ -142,7 +144,7 @@ class PPO(nn.Module):
         self.make_storage(first[0])
         played, final_observations, episodes = self.play(first)
         values = played["values"]
-        next_values = self.values_of_what_follows(values, final_observations)
+        next_values = self.bootstrap_values(values, final_observations)
 
         # From the network's units to those of the rewards.
         if self.normalize_values:
@@ -151,7 +153,7 @@ class PPO(nn.Module):
         advantages = gae(played["rewards"], values, next_values, played["terminated"],
                          played["is_last"], self.discount, self.lam)
         returns = advantages + values                          # R, targets of the value network
-        # 1 - Var[R - V] / Var[R]
+        # 1 - Var[R - V] / Var[R], of the samples that the policy is about to learn from
         unexplained = (returns - values).var() / returns.var().clamp(min=1e-8)
         self.explained_variance = 1 - unexplained
         self.batch = {                                         # by the names of loss()'s arguments
@@ -179,7 +181,7 @@ class PPO(nn.Module):
         Changes `current`.
         """
         T, E = self.steps, len(self.envs)
-        rewards, terminated, is_last = (np.zeros((T, E), np.float32) for _ in range(3))
+        rewards, terminations, is_last = (np.zeros((T, E), np.float32) for _ in range(3))
         actions, means, values = [], [], []
         final_observations, episodes = {}, []
         total, length = np.zeros(E), np.zeros(E, int)          # of the episodes under way
@@ -193,12 +195,12 @@ class PPO(nn.Module):
             values.append(value)
             actions.append(mean + noise[t])
             for e, action in enumerate(actions[t].numpy()):
-                current[e], reward, terminates, truncated, info = self.envs[e].step(action)
+                current[e], reward, terminated, truncated, info = self.envs[e].step(action)
                 rewards[t, e] = reward
-                terminated[t, e] = terminates
+                terminations[t, e] = terminated
                 total[e] += rewards[t, e]                      # as float32, as it is learned from
                 length[e] += 1
-                ended = terminates or truncated
+                ended = terminated or truncated
                 if ended or t == T - 1:
                     is_last[t, e] = True
                     final_observations[t, e] = {key: np.array(value, np.float32)
@@ -209,13 +211,13 @@ class PPO(nn.Module):
                 if ended and t < T - 1:                         # the next rollout() resets anyway
                     current[e], _ = self.envs[e].reset()
         played = {name: torch.from_numpy(array) for name, array in
-                  (("rewards", rewards), ("terminated", terminated), ("is_last", is_last))}
+                  (("rewards", rewards), ("terminated", terminations), ("is_last", is_last))}
         played["values"] = torch.stack(values)
         played["actions"] = torch.stack(actions)
         played["log_prob"] = normal_log_prob(played["actions"], torch.stack(means), log_std)
         return played, final_observations, episodes
 
-    def values_of_what_follows(self, values, final_observations):
+    def bootstrap_values(self, values, final_observations):
         """V(s_{t+1}) (T, E): the next row of `values`, or the value of a final observation."""
         # Row t+1 moves to row t. That is wrong where an episode ended and in the last row; play()
         # kept a final observation for each of those, and its value goes there.
@@ -230,14 +232,14 @@ class PPO(nn.Module):
 
     # ---- learning
 
-    def update(self, left):
-        """Improve the agent on the last rollout; `left` is the share of training that is left.
+    def update(self, remaining):
+        """Improve the agent on the last rollout; `remaining` is the share of training to come.
 
         Returns the mean diagnostics. FloatingPointError if a gradient is not finite; the weights
         are then as before that step.
         """
-        lr = self.lr * left ** self.lr_power
-        clip = self.clip * left if self.anneal_clip else self.clip
+        lr = self.lr * remaining ** self.lr_power
+        clip = self.clip * remaining if self.anneal_clip else self.clip
         for group in self.optimizer.param_groups:
             group["lr"] = lr
         batch = self.normalized_batch()
@@ -245,10 +247,10 @@ class PPO(nn.Module):
         count = len(batch["returns"])
         totals = {}
         for _ in range(self.epochs):
-            for rows in torch.randperm(count).chunk(self.minibatches):
-                part = {key: value[rows] for key, value in batch.items()}
-                obs = {key: value[rows] for key, value in observations.items()}
-                for key, value in self.minibatch_step(obs, part, clip).items():
+            for indices in torch.randperm(count).chunk(self.minibatches):
+                minibatch = {key: value[indices] for key, value in batch.items()}
+                obs = {key: value[indices] for key, value in observations.items()}
+                for key, value in self.minibatch_step(obs, minibatch, clip).items():
                     share = value.detach() / (self.epochs * self.minibatches)
                     totals[key] = totals.get(key, 0.0) + share
         totals["explained_variance"] = self.explained_variance
@@ -256,7 +258,7 @@ class PPO(nn.Module):
         return {**dict(zip(totals, averages.tolist())), "lr": lr}
 
     def normalized_batch(self):
-        """The last rollout as (B, ...) tensors with normalised returns and advantages.
+        """The last rollout as (B, ...) tensors, returns and advantages normalised if asked for.
 
         Also updates the running moments. rollout() scaled the values with the old moments; the
         targets here are normalised with the new ones. After the first few updates both are close.
@@ -279,9 +281,9 @@ class PPO(nn.Module):
             batch["advantages"] = (advantages - advantage_mean) / (std + 1e-8)
         return batch
 
-    def minibatch_step(self, obs, part, clip):
+    def minibatch_step(self, obs, minibatch, clip):
         """One step of Adam on one minibatch, with the gradient averaged over ranks and clipped."""
-        loss, stats = self.loss(obs, clip=clip, **part)
+        loss, stats = self.loss(obs, clip=clip, **minibatch)
         gradient = self.weights.grad
         gradient.zero_()
         loss.backward()                                        # adds to `gradient` by the views

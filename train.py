@@ -5,8 +5,8 @@
     python train.py --encoder lrn --resume                 go on, bit for bit as if never stopped
     python train.py --encoder lrn --paper --out runs/paper             the paper's numbers
     python train.py --encoder lrn --set z_dim=50 --out runs/z50        any of SETTINGS, by name
-    torchrun --nproc-per-node 2 train.py --encoder rn      with --nnodes on several machines (on
-                                                           one, --ranks is the simpler way)
+    torchrun --nproc-per-node 2 train.py --encoder rn      with --nnodes on several machines with
+                                                           a common disk (on one: --ranks)
 
 Data flow: observation -> a small MLP per type -> objects (B, K, D), goal (B, D) -> encoder
            -> z (B, Z) -> heads: mean (B, 9), value (B,)
@@ -50,23 +50,23 @@ class Setting(NamedTuple):
 SETTINGS = {
     # The run
     "frames": Setting(3_000_000, 60_000_000, "environment steps in all; B.3 names 50 M, CW 60 M"),
-    "envs": Setting(32, 48, "environments in all; CW: 20 x 6000 steps, as many as 48 x 2500"),
+    "envs": Setting(32, 48, "environments in all; CW: 20 x 6000 = 48 x 2500 steps a batch"),
     "steps": Setting(125, 2500, "T, steps of a rollout: one episode"),
     # The environment
     "episode_steps": Setting(125, 2500, "5 s, not 30 s (4.1): more episodes show more goals"),
-    "substeps": Setting(5, 3, "25 Hz, not 83.3 (4.1, CW): held longer, noise moves more"),
+    "substeps": Setting(5, 3, "25 Hz, not 83.3 (4.1, CW): held longer, noisy actions move more"),
     "timestep": Setting(0.008, 0.004, "s, of a physics step; CW: 0.004; 8 ms are sound (tested)"),
-    "action_mode": Setting("integrated", "absolute", "targets that stay keep a grip; CW: absolute"),
-    "action_scale": Setting(0.1, 0.1, "rad, largest step of an action"),
+    "action_mode": Setting("integrated", "absolute", "targets that last keep a grip; CW: absolute"),
+    "action_scale": Setting(0.1, 0.1, "rad, largest step of a joint target; absolute: not used"),
     "cube_mass": Setting(0.08, 0.02, "kg; CW's pushing and picking tasks: 0.02"),
     "finger_friction": Setting(1.0, 0.1, "IsaacGymEnvs; CW: 0.1, which holds no 0.08 kg"),
-    "goal_yaw": Setting(0.0, math.pi / 4, "rad, largest; 0: only the place counts (4.1: a pose)"),
+    "goal_yaw": Setting(0.0, math.pi / 4, "largest yaw, rad; 0: only the place counts (4.1: pose)"),
     "reward_overlap": Setting(100.0, 100.0, "alpha_1 (A.1)"),
     "reward_distance": Setting(5000.0, 250.0, "alpha_2 (A.1): 2 mm are worth 0.5; CW: 2500"),
     "reward_curiosity": Setting(0.0, 10.0, "alpha_3 (A.1): a penalty, smaller for a fast cube"),
     "reward_reach": Setting(2500.0, 0.0, "ours: fingertips to the cube, as in CW's script"),
     # PPO
-    "lr": Setting(2e-3, 2.5e-4, "A.2; ours takes fewer frames"),
+    "lr": Setting(2e-3, 2.5e-4, "A.2; ours learns in fewer frames"),
     "lr_power": Setting(1.0, 1.0, "lr falls as (share of training left) ^ this; A.2: linearly"),
     "clip": Setting(0.2, 0.5, "A.2; ours as usual in PPO, and in CW"),
     "anneal_clip": Setting(False, True, "rlpyt anneals the clip range as it does lr"),
@@ -84,7 +84,7 @@ SETTINGS = {
     # The networks
     "token_dim": Setting(64, 128, "D; not printed; 64 takes half the time of our guess"),
     "z_dim": Setting(25, 25, "Z (section 5)"),
-    "hidden": Setting(128, 128, "width of token MLPs and heads; not printed: a guess"),
+    "hidden": Setting(128, 128, "width of token MLPs and heads; a guess; CW: 256"),
     "heads": Setting(4, 4, "of ATTN; not printed: a guess"),
     "relations": Setting(True, True, "False: LRN without relations (figure 5)"),
     "layer_norm": Setting(True, True, "False: LRN with a mean instead (figure 5)"),
@@ -100,6 +100,10 @@ PPO_SETTINGS = ("steps", "epochs", "minibatches", "lr", "adam_eps", "clip", "dis
                 "entropy", "value_coef", "max_grad_norm", "lr_power", "anneal_clip",
                 "normalize_advantages", "normalize_values", "auxiliary")
 
+# A row of progress.csv: means over the episodes that ended in an update's rollout, with sampled
+# actions (episodes, cut_short: counts). success_aabb is the environment's fractional_success, rho,
+# at the last step, success_strict the same by true volumes, solved the share with rho >= 0.8. The
+# columns from std on are of the learner.
 PROGRESS = ("update", "frames", "episodes", "return", "length", "success_aabb", "success_strict",
             "solved", "cut_short", "std", "approx_kl", "clip_fraction", "explained_variance",
             "policy_loss", "value_loss", "auxiliary_loss", "entropy", "grad_norm", "lr")
@@ -486,7 +490,7 @@ def one_update(run, rank):
     episodes = learner.rollout(seeds)
     rollout_seconds = time.monotonic() - begin
     try:
-        stats = learner.update(left=1 - run.update / run.last_update)
+        stats = learner.update(remaining=1 - run.update / run.last_update)
     except FloatingPointError as error:                        # on every rank alike: one says so
         if rank > 0:
             sys.exit(1)
@@ -575,14 +579,17 @@ def read_command(argv=None):
     add("--seed", type=int, default=0, metavar="S",
         help="fixes every random number of the run (default 0)")
     add("--frames", type=int, metavar="F",
-        help="environment steps in all "
-             f"(default {DEFAULTS['frames']}, lift {LIFT_SETTINGS['frames']})")
+        help="environment steps in all, rounded up to whole updates "
+             f"(default {DEFAULTS['frames']}, lift {LIFT_SETTINGS['frames']}, "
+             f"--paper {SETTINGS['frames'].paper})")
     add("--out", metavar="DIR", help="run folder (default runs/TASK-ENCODER-nN-seedS)")
     add("--paper", action="store_true",
         help="the paper's numbers; where it prints none, its sources' or a guess")
     add("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE",
         help="change some of SETTINGS")
-    add("--resume", action="store_true", help="go on from the run folder's checkpoint")
+    add("--resume", action="store_true",
+        help="go on from the run folder's checkpoint; repeat --encoder, --task, --distractors, "
+             "--seed and --out")
     add("--overwrite", action="store_true", help="start anew in a folder that holds a run")
     add("--ranks", type=int, metavar="R",
         help="processes, ignored under torchrun (default one per core, or fewer if environments "
@@ -651,6 +658,8 @@ def read_value(name, text, where):
             fail(f"{where}: expected a number >= 0")
         if value > 1 and name in ("discount", "lam"):
             fail(f"{where}: expected a number from 0 to 1")
+        if abs(value) > 20 and name == "log_std":              # far beyond, exp() is infinite
+            fail(f"{where}: expected a number from -20 to 20")
     return value
 
 

@@ -31,11 +31,13 @@ GAP = 0.001                              # left free between cubes, and to the w
 WALL_SIDES = 12                          # the round wall is made of so many boxes
 GRASP_RADIUS = 0.124                     # inside it a finger can get behind a cube, m
 OUTSIDE, BELOW, ABOVE = WALL + 0.03, -0.03, 1.0                # beyond them a cube has left, m
-CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multiplies the two in touch
-# A cube's mass and the fingers' friction are arguments, because sources differ. CausalWorld (the
-# paper's simulator) has 0.08 kg (0.02 in its pushing and picking tasks) and 0.1, with which a cube
-# can hardly be held (results/grasp.py); trifinger_simulation 0.08 kg and 0.5; IsaacGymEnvs 0.08 kg
-# and 1.0, as we do. A real cube weighs 0.094 kg.
+CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multiplies those in touch
+# A cube's mass and the fingers' friction are arguments, because sources differ:
+#   CausalWorld (the paper's simulator)   0.08 kg (its pushing and picking tasks: 0.02), friction
+#                                         0.1, too little to hold 0.08 kg (results/grasp.py)
+#   trifinger_simulation                  0.08 kg, friction 0.5
+#   IsaacGymEnvs, and we                  0.08 kg, friction 1.0
+# A real cube weighs 0.094 kg.
 IDENTIFIER_POOL = np.linspace(-1.0, 1.0, 21)                   # none is new when N grows
 HIGHEST_GOAL = 0.2                       # height of the centre of the highest goal in lifting, m
 FIXED = 5                                # squares never nudged: three fingers, goal, target
@@ -67,8 +69,7 @@ LINEAR, ANGULAR = slice(11, 14), slice(14, 17)                             # of 
 IDENTIFIER = -1                                                            # of a cube and the goal
 FINGER_IDENTIFIER, FINGERTIP = 6, slice(7, 10)                             # of a finger
 
-# What each column is divided by to be within about [-1, 1]: fixed numbers, so that nothing here
-# depends on N.
+# What each column is divided by to be of order 1: fixed numbers, so that nothing here depends on N.
 POSITION_SCALE = 0.2                     # m
 POSE_SCALE = [1] + [CUBE] * 3 + [POSITION_SCALE] * 3 + [1] * 4             # type size pos quat
 CUBE_SCALE = POSE_SCALE + [0.5] * 3 + [10] * 3 + [1]                       # ... v omega id
@@ -124,7 +125,7 @@ def fingertips(q):
 
 def clip(values, low, high):
     """Values limited to [low, high] one by one; on nine numbers plain python beats numpy."""
-    return [a if v < a else b if v > b else v for v, a, b in zip(values, low, high)]
+    return [lo if v < lo else hi if v > hi else v for v, lo, hi in zip(values, low, high)]
 
 
 def yaw_quaternion(yaw):
