@@ -3929,6 +3929,8 @@ def test_reproduce_lists_what_a_pattern_names_and_refuses_unknown_options():
                   ["--jobs", "many"]):
         refused = reproduce(*words)
         assert refused.returncode == 2 and len(refused.stderr.splitlines()) == 1, words
+    shipped = reproduce("^lift-rn-n2-seed0$")
+    assert shipped.returncode == 0 and "remove results/NAME" in shipped.stdout
 
 
 @pytest.mark.parametrize("name, arguments, numbers", [

@@ -136,9 +136,9 @@ def bar_of(rows, i, measure):
         return rows["ci95_strict"][i]
     # Of a share (Agresti and Coull): as if two more episodes were solved and two were not.
     # 1.96 sqrt(p (1 - p) / n) alone would call 0 of 200 certain.
-    episodes = rows["episodes"][i] + 4
-    share = (rows["solved"][i] * rows["episodes"][i] + 2) / episodes
-    return 1.96 * np.sqrt(share * (1 - share) / episodes)
+    n = rows["episodes"][i]
+    share = (rows["solved"][i] * n + 2) / (n + 4)
+    return 1.96 * np.sqrt(share * (1 - share) / (n + 4))
 
 
 def cell(values, bars):

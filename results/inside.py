@@ -133,11 +133,13 @@ def figure_7(episodes):
     embedding = tsne()
     run = os.path.join(HERE, "push-lrn-n2-seed0")
     rows, kinds = [], []
-    for N in range(3, 7):
+    numbers = range(3, 7)
+    for N in numbers:
         r = moments(record(run, N, episodes, relations_of))    # (n, K, D)
-        r = some(r, POINTS // (4 * r.shape[1]))
+        K = N + 4                                              # and the target, three fingers
+        r = some(r, POINTS // (len(numbers) * K))
         rows += list(r.reshape(-1, r.shape[-1]))
-        of_one_state = [*KINDS, *["distractors"] * (N - 1)]    # KINDS ends with the first of N
+        of_one_state = [*list(KINDS)[:FIRST_DISTRACTOR], *["distractors"] * N]
         kinds += of_one_state * len(r)
     places = embedding.fit_transform(np.array(rows))
     write("figure7.csv", ("kind", "x", "y"),

@@ -128,6 +128,8 @@ state_of() {
         echo "done"
     elif [ -e "runs/$1/checkpoint.pt" ]; then
         tail -n 1 "runs/$1/progress.csv" | awk -F, '{ printf "begun, %.1f M frames\n", $2 / 1e6 }'
+    elif [ -e "results/unfinished/$1/progress.csv" ]; then
+        echo "to do (unfinished/)"
     else
         echo "to do"
     fi
@@ -192,15 +194,18 @@ main() {
     [ "$rows" ] || fail "no run's name matches $pattern"
     if [ "$list" ]; then
         while read -r name arguments; do
-            printf "%-34s %-24s %s\n" "$name" "$(state_of "$name")" "$arguments"
+            printf "%-44s %-24s %s\n" "$name" "$(state_of "$name")" "$arguments"
         done <<< "$rows"
         exit
     fi
-    while read -r name arguments; do
-        if [ "$(state_of "$name")" != "done" ]; then
-            echo "$name $arguments"
-        fi
-    done <<< "$rows" | xargs -r -P "$jobs" -L 1 results/reproduce.sh --one
+    left=$(while read -r name arguments; do
+        [ "$(state_of "$name")" = "done" ] || echo "$name $arguments"
+    done <<< "$rows")
+    if [ "$left" ]; then
+        xargs -P "$jobs" -L 1 results/reproduce.sh --one <<< "$left"
+    else
+        echo "done before; to train one anew, remove results/NAME and runs/NAME first"
+    fi
 }
 
 main "$@"; exit
