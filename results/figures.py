@@ -26,7 +26,6 @@ MEASURES = {                             # column of zeroshot.csv -> title of it
 # Student's t for a 95 % interval, by the number of seeds
 STUDENT = {2: 12.71, 3: 4.303, 4: 3.182, 5: 2.776, 6: 2.571, 7: 2.447, 8: 2.365, 9: 2.306,
            10: 2.262}
-TASKS = {"push": "PushingCube", "lift": "LiftingCube"}
 BLUE, RED, GREEN, YELLOW = "#0072B2", "#CC3311", "#009E73", "#AA8800"
 ENCODERS = {                             # of figures 3, 4 and 6 -> label, colour
     "lrn": ("LRN", BLUE),
@@ -101,7 +100,7 @@ def read(run, name):
 
 def shipped_runs():
     """Run folders in this folder: task by task, encoder by encoder, group by group."""
-    return [run for task in TASKS for encoder in (*ENCODERS, "mlp")
+    return [run for task in ("push", "lift") for encoder in (*ENCODERS, "mlp")
             for run in sorted(glob.glob(f"{HERE}/{task}-{encoder}-n[0-9]*-seed?"),
                               key=lambda path: (group_of(path), path))]
 
@@ -355,22 +354,27 @@ def figure_1(folder):
 
 
 def figure_3(folder):
-    """Figure 3: training at 2 distractors (left), zero-shot at others (right); a row for a task."""
+    """Figure 3: training at 2 distractors (left), zero-shot at others (right).
+
+    A row for each task, and one for pushing in the paper's world, with the paper's reward.
+    """
     plt = pyplot()
     groups = by_seed(shipped_runs())
-    figure, axes = plt.subplots(2, 2, figsize=(9, 8), layout="constrained")
-    for task, (left, right) in zip(TASKS, axes):
+    rows = {"PushingCube": "push-{}-n2", "LiftingCube": "lift-{}-n2",
+            "Pushing, paper's world": "push-{}-n2-paperworld-long"}
+    figure, axes = plt.subplots(len(rows), 2, figsize=(9, 4 * len(rows)), layout="constrained")
+    for (title, name), (left, right) in zip(rows.items(), axes):
         for encoder, (label, color) in ENCODERS.items():
-            runs = groups.get(f"{task}-{encoder}-n2")
+            runs = groups.get(name.format(encoder))
             if not runs:
                 continue
             progress = [smooth(read(run, "progress.csv"), "success_aabb") for run in runs]
             curves = [success for _, success in progress]
             draw(left, progress[0][0], curves, with_seeds(label, runs), color)
             draw_zero_shot(right, over_seeds(runs, "success_aabb"), label, color)
-        left.set(title=f"{TASKS[task]}: training at N = 2", xlabel="million frames",
+        left.set(title=f"{title}: training at N = 2", xlabel="million frames",
                  ylabel="fractional success (axis-aligned)", ylim=(0, 1))
-        right.set(title=f"{TASKS[task]}: zero-shot", xlabel="N, distractors at test time",
+        right.set(title=f"{title}: zero-shot", xlabel="N, distractors at test time",
                   ylim=(0, 1), xticks=[0, 2, 5, 9, 14, 19])
         left.legend(loc="lower right")
         right.legend(loc="lower left", fontsize=8)
