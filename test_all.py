@@ -3911,6 +3911,7 @@ def test_what_we_added_is_the_success_in_training_of_the_runs(results_scripts):
 def test_scores_of_the_readme_are_those_of_the_files():
     rows = table_rows(read(os.path.join(HERE, "README.md")).decode(), "| N |")
     groups = {"PushingCube, LRN": "push-lrn-n2", "PushingCube, LRN-max": "push-lrn-max-n2",
+              "PushingCube in the paper's world, LRN": "push-lrn-n2-paperworld-long",
               "LiftingCube, LRN": "lift-lrn-n2"}
     for label, group in groups.items():
         runs = sorted(glob.glob(os.path.join(HERE, "results", f"{group}-seed?", "zeroshot.csv")))
