@@ -2286,23 +2286,23 @@ def test_every_update_plays_other_episodes_and_is_told_how_much_is_left(
         tmp_path, monkeypatch, command):
     """What train() asks of its learner; 600 frames in updates of 200, then one more for 601."""
     rollout, update = PPO.rollout, PPO.update
-    seeds, noises, lefts = [], [], []
+    seeds, noises, shares = [], [], []
 
     def watched_rollout(self, some_seeds):
         seeds.extend(some_seeds)
         noises.append(torch.initial_seed())
         return rollout(self, some_seeds)
 
-    def watched_update(self, left):
-        lefts.append(left)
-        return update(self, left)
+    def watched_update(self, remaining):
+        shares.append(remaining)
+        return update(self, remaining)
 
     monkeypatch.setattr(PPO, "rollout", watched_rollout)
     monkeypatch.setattr(PPO, "update", watched_update)
     for seed in range(2):
         command("train.py --ranks 1 --frames 601 --seed", seed, "--out", tmp_path / str(seed),
                 *SMALL)
-    assert lefts == [1.0, 0.75, 0.5, 0.25] * 2
+    assert shares == [1.0, 0.75, 0.5, 0.25] * 2
     assert len(set(seeds)) == len(seeds) == 2 * 4 * 4
     assert len(set(noises)) == len(noises) == 2 * 4
 

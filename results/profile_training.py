@@ -48,7 +48,7 @@ def train(updates, learner):
         if update == 1:
             spent.update(dict.fromkeys(spent, 0.0))
         learner.rollout(range(E * update, E * (update + 1)))
-        learner.update(left=1.0)
+        learner.update(remaining=1.0)
     for env in learner.envs:
         env.close()
     return updates * E * learner.steps
