@@ -153,7 +153,7 @@ class PPO(nn.Module):
         advantages = gae(played["rewards"], values, next_values, played["terminated"],
                          played["is_last"], self.discount, self.lam)
         returns = advantages + values                          # R, targets of the value network
-        # 1 - Var[R - V] / Var[R], of the samples that the policy is about to learn from
+        # 1 - Var[R - V] / Var[R]
         unexplained = (returns - values).var() / returns.var().clamp(min=1e-8)
         self.explained_variance = 1 - unexplained
         self.batch = {                                         # by the names of loss()'s arguments

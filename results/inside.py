@@ -136,8 +136,7 @@ def figure_7(episodes):
     numbers = range(3, 7)
     for N in numbers:
         r = moments(record(run, N, episodes, relations_of))    # (n, K, D)
-        K = N + 4                                              # and the target, three fingers
-        r = some(r, POINTS // (len(numbers) * K))
+        r = some(r, POINTS // (len(numbers) * r.shape[1]))     # as many points at every N, about
         rows += list(r.reshape(-1, r.shape[-1]))
         of_one_state = [*list(KINDS)[:FIRST_DISTRACTOR], *["distractors"] * N]
         kinds += of_one_state * len(r)
