@@ -60,23 +60,6 @@ def rank_mean(tensor):
     return tensor
 
 
-def as_one_vector(agent):
-    """Move all weights of `agent` into one vector, and their gradients into its `.grad`.
-
-    The agent's parameters become views of it. Averaging over ranks, clipping and Adam then take a
-    few operations in all; done layer by layer, they would cost as much as the matrix products on
-    networks this small. Keep the views: never set a gradient to None, never call agent.to().
-    """
-    parameters = list(agent.parameters())
-    weights = nn.utils.parameters_to_vector(parameters).detach()
-    weights.grad = torch.zeros_like(weights)
-    nn.utils.vector_to_parameters(weights, parameters)         # shared memory, not a copy
-    sizes = [p.numel() for p in parameters]
-    for p, gradient in zip(parameters, weights.grad.split(sizes)):
-        p.grad = gradient.view_as(p)
-    return weights
-
-
 class PPO(nn.Module):
     """The learner: agent, optimiser and value normaliser. Defaults suit small problems such as the
     example below; train.py sets every one of them (SETTINGS).
@@ -120,9 +103,7 @@ class PPO(nn.Module):
         self.register_buffer("return_mean", torch.zeros(()))
         self.register_buffer("return_square", torch.ones(()))
         self.register_buffer("return_batches", torch.zeros(()))
-        self.weights = as_one_vector(agent)
-        self.optimizer = torch.optim.Adam([self.weights], lr=lr, eps=adam_eps)
-        self.observations = None
+        self.optimizer = torch.optim.Adam(agent.parameters(), lr=lr, eps=adam_eps, fused=True)
 
     def return_std(self):
         variance = self.return_square - self.return_mean ** 2
@@ -141,13 +122,10 @@ class PPO(nn.Module):
         of the last step.
         """
         first = [env.reset(seed=seed)[0] for env, seed in zip(self.envs, seeds)]
-        self.make_storage(first[0])
         played, final_observations, episodes = self.play(first)
         values = played["values"]
         next_values = self.bootstrap_values(values, final_observations)
-
-        # From the network's units to those of the rewards.
-        if self.normalize_values:
+        if self.normalize_values:        # from the network's units to those of the rewards
             values = values * self.return_std() + self.return_mean
             next_values = next_values * self.return_std() + self.return_mean
         advantages = gae(played["rewards"], values, next_values, played["terminated"],
@@ -164,15 +142,6 @@ class PPO(nn.Module):
         }
         return episodes
 
-    def make_storage(self, observation):
-        """Room for T observations of E environments, the same memory for numpy and for torch."""
-        if self.observations is not None:
-            return
-        T, E = self.steps, len(self.envs)
-        self.arrays = {key: np.zeros((T, E, *value.shape), np.float32)
-                       for key, value in observation.items()}
-        self.observations = {key: torch.from_numpy(array) for key, array in self.arrays.items()}
-
     def play(self, current):
         """Play T steps from the observations `current`, one per environment.
 
@@ -181,13 +150,15 @@ class PPO(nn.Module):
         Changes `current`.
         """
         T, E = self.steps, len(self.envs)
+        self.observations = {key: torch.empty(T, E, *value.shape)
+                             for key, value in current[0].items()}
         rewards, terminations, is_last = (np.zeros((T, E), np.float32) for _ in range(3))
         actions, means, values = [], [], []
         final_observations, episodes = {}, []
         total, length = np.zeros(E), np.zeros(E, int)          # of the episodes under way
         for t in range(T):
-            for key, array in self.arrays.items():
-                array[t] = [observation[key] for observation in current]
+            for key, stored in self.observations.items():
+                stored[t] = torch.from_numpy(np.stack([obs[key] for obs in current]))
             mean, log_std, value = self.agent({key: x[t] for key, x in self.observations.items()})
             if t == 0:                                         # one draw for all T steps
                 noise = torch.randn(T, *mean.shape) * log_std.exp()        # (T, E, A)
@@ -208,13 +179,13 @@ class PPO(nn.Module):
                 if ended:
                     episodes.append({"return": total[e], "length": int(length[e]), "info": info})
                     total[e] = length[e] = 0
-                if ended and t < T - 1:                         # the next rollout() resets anyway
+                if ended and t < T - 1:                        # the next rollout() resets anyway
                     current[e], _ = self.envs[e].reset()
-        played = {name: torch.from_numpy(array) for name, array in
-                  (("rewards", rewards), ("terminated", terminations), ("is_last", is_last))}
-        played["values"] = torch.stack(values)
-        played["actions"] = torch.stack(actions)
-        played["log_prob"] = normal_log_prob(played["actions"], torch.stack(means), log_std)
+        actions = torch.stack(actions)
+        played = {"rewards": torch.from_numpy(rewards), "values": torch.stack(values),
+                  "terminated": torch.from_numpy(terminations), "actions": actions,
+                  "is_last": torch.from_numpy(is_last),
+                  "log_prob": normal_log_prob(actions, torch.stack(means), log_std)}
         return played, final_observations, episodes
 
     def bootstrap_values(self, values, final_observations):
@@ -244,10 +215,9 @@ class PPO(nn.Module):
             group["lr"] = lr
         batch = self.normalized_batch()
         observations = {key: value.flatten(0, 1) for key, value in self.observations.items()}
-        count = len(batch["returns"])
         totals = {}
         for _ in range(self.epochs):
-            for indices in torch.randperm(count).chunk(self.minibatches):
+            for indices in torch.randperm(len(batch["returns"])).chunk(self.minibatches):
                 minibatch = {key: value[indices] for key, value in batch.items()}
                 obs = {key: value[indices] for key, value in observations.items()}
                 for key, value in self.minibatch_step(obs, minibatch, clip).items():
@@ -284,14 +254,16 @@ class PPO(nn.Module):
     def minibatch_step(self, obs, minibatch, clip):
         """One step of Adam on one minibatch, with the gradient averaged over ranks and clipped."""
         loss, stats = self.loss(obs, clip=clip, **minibatch)
-        gradient = self.weights.grad
-        gradient.zero_()
-        loss.backward()                                        # adds to `gradient` by the views
-        rank_mean(gradient)                                    # in place
-        norm = gradient.norm()
+        self.optimizer.zero_grad()
+        loss.backward()
+        weights = [p for p in self.agent.parameters() if p.grad is not None]
+        if dist.is_initialized():                              # all gradients in one message
+            gradient = rank_mean(torch.cat([p.grad.flatten() for p in weights]))
+            for p, mean in zip(weights, gradient.split([p.numel() for p in weights])):
+                p.grad.copy_(mean.view_as(p))
+        norm = nn.utils.clip_grad_norm_(weights, self.max_grad_norm)
         if not torch.isfinite(norm):
             raise FloatingPointError(f"the gradient is not finite (loss {loss.item()})")
-        gradient *= (self.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
         self.optimizer.step()
         return {**stats, "grad_norm": norm}
 
@@ -308,27 +280,21 @@ class PPO(nn.Module):
         value_loss = 0.5 * (value - returns).square().mean()
         # H of a Gaussian: sum_j (log sigma_j + log(2 pi e) / 2)
         entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
-        # L = L_policy + c_v L_value - c_e H, and below it + c_a auxiliary
-        loss = policy_loss + self.value_coef * value_loss - self.entropy_coef * entropy
+        auxiliary_loss = self.agent.auxiliary(obs) if self.auxiliary_coef else torch.zeros(())
+        loss = (policy_loss + self.value_coef * value_loss - self.entropy_coef * entropy
+                + self.auxiliary_coef * auxiliary_loss)
 
-        auxiliary_loss = torch.zeros(())
-        if self.auxiliary_coef:
-            auxiliary_loss = self.agent.auxiliary(obs)
-            loss = loss + self.auxiliary_coef * auxiliary_loss
         with torch.no_grad():
             # E[(ratio - 1) - log ratio]: unbiased and never negative ("k3", Schulman, 2020)
             approx_kl = ((ratio - 1) - log_ratio).mean()
             clip_fraction = ((ratio - 1).abs() > clip).float().mean()
-        stats = {
-            "policy_loss": policy_loss,
-            "value_loss": value_loss,
-            "auxiliary_loss": auxiliary_loss,
-            "entropy": entropy,
-            "approx_kl": approx_kl,
-            "clip_fraction": clip_fraction,
-        }
+        stats = {"policy_loss": policy_loss, "value_loss": value_loss,
+                 "auxiliary_loss": auxiliary_loss, "entropy": entropy,
+                 "approx_kl": approx_kl, "clip_fraction": clip_fraction}
         return loss, stats
 
+
+# ---- an example
 
 class PointOnLine:
     """A 1-D example: move a point by at most 0.2 a step to within 0.1 of a target."""
@@ -366,6 +332,7 @@ class TinyAgent(nn.Module):
 
 
 if __name__ == "__main__":
+    torch.set_num_threads(1)             # more do not pay on networks this small
     torch.manual_seed(0)
     learner = PPO(TinyAgent(), [PointOnLine() for _ in range(8)], steps=64, lr=3e-3)
     for update in range(30):

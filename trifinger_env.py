@@ -3,16 +3,16 @@
 A three-finger robot (9 joints) stands over a round arena with N+1 identical cubes. The goal names
 one of them by an identifier; that cube has to reach the goal pose, the other N are distractors.
 The robot and the arena are made of primitives by this file: no mesh, no data file. The class has
-Gymnasium's signatures, and with gymnasium installed it is a gymnasium.Env.
+Gymnasium's signatures; with gymnasium installed it is a gymnasium.Env, and importing this module
+registers "TriFingerPush-v0" and "TriFingerLift-v0".
 
 Shapes: observation {"cubes": (N+1, 18), "fingers": (3, 10), "goal": (12,)} float32 (Table 1),
         action (9,) in [-1, 1].
-Run:    python trifinger_env.py        prints frames/s by N, and step() / bare physics
+Run:    python trifinger_env.py        one episode of random actions, and frames/s
 """
 import math
 import os
 import sys
-import tempfile
 import time
 from typing import NamedTuple
 
@@ -20,9 +20,10 @@ import numpy as np
 import pybullet as pb
 
 try:
+    import gymnasium
     from gymnasium import Env, spaces
 except ImportError:                      # the same class without it
-    Env, spaces = object, None
+    gymnasium, Env, spaces = None, object, None
 
 # The arena
 CUBE = 0.065                             # edge of a cube, m
@@ -34,31 +35,46 @@ OUTSIDE, BELOW, ABOVE = WALL + 0.03, -0.03, 1.0                # beyond them a c
 CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multiplies those in touch
 # A cube's mass and the fingers' friction are arguments, because sources differ:
 #   CausalWorld (the paper's simulator)   0.08 kg (its pushing and picking tasks: 0.02), friction
-#                                         0.1, too little to hold 0.08 kg (results/grasp.py)
+#                                         0.1, too little to hold 0.08 kg
 #   trifinger_simulation                  0.08 kg, friction 0.5
 #   IsaacGymEnvs, and we                  0.08 kg, friction 1.0
 # A real cube weighs 0.094 kg.
 IDENTIFIER_POOL = np.linspace(-1.0, 1.0, 21)                   # none is new when N grows
 HIGHEST_GOAL = 0.2                       # height of the centre of the highest goal in lifting, m
-FIXED = 5                                # squares never nudged: three fingers, goal, target
+ITERATIONS = 16                          # of Bullet's solver: with fewer, grips slip (tested)
 
 # The robot: three fingers of three joints each, upper, middle and lower
 JOINTS = (0, 1, 2)
 BASE = 0.0455                            # radius at which fingers are mounted, m
 HEIGHT = 0.34                            # height at which fingers are mounted, m
 LINK = 0.16                              # length of the middle and the lower link, m
-OFFSET = 0.05945                         # how far a fingertip stands beside the finger's plane, m:
-                                         # the sideways parts of finger_urdf(), added up
 TIP = 0.0095                             # radius of a finger's lower link and tip, m
 TIP_HALF_EDGE = 0.014                    # of the square that a tip at rest keeps free of cubes, m
 JOINT_LOW = (-1.57, -1.2, -3.0)          # limits of upper, middle and lower joint, rad
 JOINT_HIGH = (1.0, 1.57, 3.0)
 REST = (0.0, 0.55, -0.7)                 # at reset, rad: tips hang beside the cubes, 0.045 m high
-TORQUE = 0.36                            # N m
 LEAD = 0.25                              # rad, how far an integrated target may lead its joint
 FINGER_YAW = [-math.radians(90 + 120 * k) for k in range(3)]   # heading of finger k
 FINGER_MOUNT = [(-BASE * math.cos(yaw), -BASE * math.sin(yaw), HEIGHT) for yaw in FINGER_YAW]
 FINGER_SIN_COS = [(math.sin(yaw), math.cos(yaw)) for yaw in FINGER_YAW]
+
+# Upper, middle and lower link as in TriFingerEdu's URDF (the tip is merged into the lower link):
+# where its joint sits in the link before it, the joint's axis, mass, centre of mass, inertia.
+KNEE, TIP_PLACE = (0.0, -0.03745, -LINK), (0.0, -0.008, -LINK)
+JOINT_PLACE = ((0.0, 0.0, 0.0), (0.0, -0.014, 0.0), KNEE)                  # m
+JOINT_AXIS = ((-1, 0, 0), (0, 1, 0), (0, 1, 0))
+MASS = (0.14854, 0.14854, 0.0407)                                          # kg
+CENTRE_OF_MASS = ((-0.079, 0.0, 0.0), (0.0, -0.019, -0.079), (0.0, -0.00875, -0.1065))     # m
+INERTIA = ((3e-5, 4.1e-4, 4.1e-4), (4.1e-4, 4.1e-4, 3e-5), (1.6e-4, 1.6e-4, 1e-5))     # kg m^2
+OFFSET = 0.05945                         # how far a tip stands beside its finger's plane, m: the
+                                         # sideways parts of JOINT_PLACE and TIP_PLACE, added up
+
+# The motors. Bullet's own aims at a speed of GAIN x (target - angle), with at most TORQUE.
+GAIN = 12.5                              # 1/s
+TORQUE = 0.36                            # N m
+# CausalWorld's is a torque u = KP (target - angle) - KD speed, from which safety damping takes
+# DAMPING x speed; both are cut to TORQUE. At full torque the joints reach 2.0, 0.95 and 8.8 rad/s.
+KP, KD, DAMPING = 10.0, (0.1, 0.3, 0.001), (0.08, 0.08, 0.04)
 
 # Table 1: columns of an observation's rows, for readers and for whoever picks some out. The
 # identifier comes last in cubes and goal. In action_mode "integrated" a fingertip is shown where
@@ -77,8 +93,9 @@ GOAL_SCALE = POSE_SCALE + [1]                                              # ...
 FINGER_SCALE = [1.5] * 3 + [10] * 3 + [1] + [POSITION_SCALE] * 3           # q dq id tip
 CUBE_WIDTH, FINGER_WIDTH, GOAL_WIDTH = len(CUBE_SCALE), len(FINGER_SCALE), len(GOAL_SCALE)
 
-BETA = 0.05                              # exponent of the curiosity term (A.1)
+# Equation 2 (A.1); "reach" is ours. A term of your own: its weight here, its formula in _rewards().
 REWARD_WEIGHTS = {"overlap": 100.0, "distance": 5000.0, "curiosity": 0.0, "reach": 2500.0}
+BETA = 0.05                              # exponent of the curiosity term
 SOLVED = 0.8                             # fractional success from which a task counts as solved
 TIME, LEFT, DIVERGED = "time", "a cube left the arena", "the physics diverged"     # truncated_by
 
@@ -95,27 +112,6 @@ def forward_kinematics(k, q):
     z = OFFSET * s0 + depth * c0
     s, c = FINGER_SIN_COS[k]                                   # turn by the finger's heading
     return c * x - s * y, s * x + c * y, z + HEIGHT
-
-
-def inverse_kinematics(k, tip):
-    """Joint angles (3,) in rad that bring finger k's tip to `tip` (3,) in m.
-
-    For scripted grasps (tests, results/grasp.py): no agent uses it. ValueError if the tip is out of
-    reach. Joint limits are not looked at.
-    """
-    s, c = FINGER_SIN_COS[k]
-    x = c * tip[0] + s * tip[1] + BASE
-    y = -s * tip[0] + c * tip[1]
-    z = tip[2] - HEIGHT
-    depth_squared = y * y + z * z - OFFSET ** 2
-    depth = -math.sqrt(max(depth_squared, 0.0))
-    length = math.hypot(x, depth)                              # from the middle joint to the tip
-    if depth_squared < 0 or length > 2 * LINK:
-        raise ValueError(f"finger {k} cannot reach {tuple(tip)}")
-    q0 = math.remainder(math.atan2(depth, -OFFSET) - math.atan2(z, y), 2 * math.pi)
-    q2 = -2 * math.acos(length / (2 * LINK))
-    q1 = math.atan2(-x, -depth) - q2 / 2
-    return q0, q1, q2
 
 
 def fingertips(q):
@@ -163,72 +159,18 @@ def aabb_overlap(cube, goal):
     return min(share, 1.0)
 
 
+ALONG = CUBE * ((np.arange(20) + 0.5) / 20 - 0.5)              # 20 points along a cube's edge, m
+GRID = np.stack(np.meshgrid(ALONG, ALONG, ALONG), axis=-1).reshape(-1, 3)  # 8000 points in a cube
+
+
 def oriented_overlap(cube, goal):
     """The strict form of rho: share of the goal cube's true volume that the cube covers.
 
-    Works in the goal's frame: cuts the cube by the goal's six planes (Sutherland-Hodgman) and
-    measures what is left.
+    That is the share of a grid's points in the goal cube which lie in the cube, too.
     """
-    to_goal = rotation(goal[1]).T
-    centre = to_goal @ np.subtract(cube[0], goal[0])
-    axes = to_goal @ rotation(cube[1])
-    faces = cube_faces(centre, axes)
-    for axis in range(3):
-        for sign in (-1, 1):
-            faces = cut(faces, axis, sign)
-    return float(min(volume(faces) / CUBE ** 3, 1.0))
-
-
-def cube_faces(centre, axes):
-    """The six faces of a cube, each a list of four corners (3,) in order; `axes` are columns."""
-    faces, half = [], CUBE / 2
-    for i in range(3):
-        u = axes[:, (i + 1) % 3] * half
-        v = axes[:, (i + 2) % 3] * half
-        for side in (-half, half):
-            middle = centre + axes[:, i] * side
-            faces.append([middle + a * u + b * v for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
-    return faces
-
-
-def cut(faces, axis, sign):
-    """What is left of a convex body inside the goal's plane sign * x[axis] = CUBE / 2.
-
-    Points on the plane count as inside. `cap` gathers the points where edges cross the plane: they
-    are the corners of the new face that closes the body again.
-    """
-    kept, cap = [], []
-    for face in faces:
-        inside = []
-        for p, q in zip(face, face[1:] + face[:1]):
-            beyond_p = sign * p[axis] - CUBE / 2               # > 0: beyond the plane
-            beyond_q = sign * q[axis] - CUBE / 2
-            if beyond_p <= 0:
-                inside.append(p)
-            if beyond_p <= 0 < beyond_q or beyond_q <= 0 < beyond_p:
-                crossing = p + (q - p) * beyond_p / (beyond_p - beyond_q)
-                inside.append(crossing)
-                cap.append(crossing)
-        if len(inside) > 2:
-            kept.append(inside)
-    if len(cap) > 2:                                           # in order round their middle
-        spokes = np.array(cap) - np.mean(cap, axis=0)
-        angles = np.arctan2(spokes[:, axis - 1], spokes[:, axis - 2])      # the two other axes
-        kept.append([cap[j] for j in np.argsort(angles)])
-    return kept
-
-
-def volume(faces):
-    """Volume of a convex body: the sum of the pyramids from a point inside to every triangle."""
-    if not faces:
-        return 0.0
-    inside = np.mean([corner for face in faces for corner in face], axis=0)
-    total = 0.0
-    for face in faces:
-        for second, third in zip(face[1:], face[2:]):
-            normal = np.cross(second - face[0], third - face[0])
-            total += abs(np.dot(normal, face[0] - inside)) / 6
-    return total
+    points = GRID @ rotation(goal[1]).T + goal[0]              # in the world
+    in_cube = (points - cube[0]) @ rotation(cube[1])           # in the frame of the cube
+    return float((np.abs(in_cube) <= CUBE / 2).all(axis=1).mean())
 
 
 def squares_overlap(a, b):
@@ -259,74 +201,6 @@ def corners_inside(squares):
     return (np.hypot(x, y) < WALL - GAP).all(1)
 
 
-# ---- the robot as an URDF
-
-JOINT_COLOR, METAL, PLASTIC = "0.95 0.55 0.15 1", "0.45 0.47 0.52 1", "0.2 0.2 0.23 1"
-
-
-def origin(xyz, rpy=(0, 0, 0)):
-    return f'<origin xyz="{" ".join(map(str, xyz))}" rpy="{" ".join(map(str, rpy))}"/>'
-
-
-def picture(place, shape, color):
-    """A visual element; without an effect on the dynamics."""
-    return (f'<visual>{place}<geometry>{shape}</geometry>'
-            f'<material name="{color}"><color rgba="{color}"/></material></visual>\n')
-
-
-def bar(start, end, radius, color):
-    """Picture of a capsule from `start` to `end` (3,)."""
-    start, end = np.array(start, float), np.array(end, float)
-    x, y, z = end - start
-    length = math.hypot(x, y, z)
-    along = (0, math.acos(z / length), math.atan2(y, x))       # roll, pitch, yaw of the axis
-    shape = f'<capsule radius="{radius}" length="{length}"/>'
-    return picture(origin((start + end) / 2, along), shape, color)
-
-
-def ball(centre, radius, color):
-    """Picture of a sphere."""
-    return picture(origin(centre), f'<sphere radius="{radius}"/>', color)
-
-
-def link(name, mass, centre_of_mass, inertia, pictures, collision=""):
-    ixx, iyy, izz = inertia
-    return (f'<link name="{name}"><inertial>{origin(centre_of_mass)}<mass value="{mass}"/>'
-            f'<inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0" ixz="0" iyz="0"/></inertial>'
-            f'\n{"".join(pictures)}{collision}</link>\n')
-
-
-def joint(parent, child, place, axis, lower, upper):
-    return (f'<joint name="{child}" type="revolute"><parent link="{parent}"/>'
-            f'<child link="{child}"/>{place}<axis xyz="{axis}"/>'
-            f'<limit lower="{lower}" upper="{upper}" effort="{TORQUE}" velocity="100"/></joint>\n')
-
-
-def finger_urdf():
-    """URDF of one finger: masses and inertias of TriFingerEdu, the tip merged into the lower link.
-
-    Only the lower link can touch things. What is drawn reaches from joint to joint.
-    """
-    knee, tip = (0, -0.03745, -LINK), (0, -0.008, -LINK)       # the lower joint, the fingertip
-    touching = (f'<collision>{origin((0, -0.008, -LINK / 2))}<geometry>'
-                f'<capsule radius="{TIP}" length="{LINK}"/></geometry></collision>')
-    hub = [bar((BASE, 0, 0), (0, 0, 0), 0.018, METAL)]         # from the robot's centre
-    upper = [ball((0, 0, 0), 0.021, JOINT_COLOR), bar((0, 0, 0), (-0.10, 0, 0), 0.017, PLASTIC)]
-    middle = [ball((0, 0, 0), 0.019, JOINT_COLOR), bar((0, 0, 0), knee, 0.013, METAL)]
-    lower = [ball((0, 0, 0), 0.016, JOINT_COLOR), ball(tip, 0.011, JOINT_COLOR),
-             bar((0, 0, 0), tip, TIP, PLASTIC)]
-    parts = [
-        link("base", 0, (0, 0, 0), (0, 0, 0), hub),
-        link("upper", 0.14854, (-0.079, 0, 0), (3e-5, 4.1e-4, 4.1e-4), upper),
-        link("middle", 0.14854, (0, -0.019, -0.079), (4.1e-4, 4.1e-4, 3e-5), middle),
-        link("lower", 0.0407, (0, -0.00875, -0.1065), (1.6e-4, 1.6e-4, 1e-5), lower, touching),
-        joint("base", "upper", origin((0, 0, 0)), "-1 0 0", JOINT_LOW[0], JOINT_HIGH[0]),
-        joint("upper", "middle", origin((0, -0.014, 0)), "0 1 0", JOINT_LOW[1], JOINT_HIGH[1]),
-        joint("middle", "lower", origin(knee), "0 1 0", JOINT_LOW[2], JOINT_HIGH[2]),
-    ]
-    return f'<robot name="finger">{"".join(parts)}</robot>'
-
-
 # ---- the environment
 
 class Moment(NamedTuple):
@@ -348,9 +222,10 @@ class TriFingerEnv(Env):
                     episode_steps=2500, substeps=3, timestep=0.004.
     action_mode     "integrated": joint target = last target + action_scale * action, so that a zero
                     action keeps a grip; at most LEAD away from the measured angle;
-                    "delta": joint target = measured angle + action_scale * action;
                     "absolute": the action spans the joint range.
     action_scale    largest step of a joint target, rad; without effect on "absolute"
+    motor           what draws the joints to their targets: "position", Bullet's motor, or "torque",
+                    CausalWorld's law, anew in every physics step (it needs steps of 4 ms)
     cube_mass       kg
     finger_friction of a finger; times that of what it touches (cube 1.0, floor 0.5) in Bullet
     goal_yaw        goal's largest yaw in rad. With 0 rho asks for the position only.
@@ -367,19 +242,20 @@ class TriFingerEnv(Env):
 
     # Without train.py these defaults count; with it SETTINGS, which are the same (tested).
     def __init__(self, task="push", distractors=2, *, episode_steps=125, substeps=5,
-                 timestep=0.008, action_mode="integrated", action_scale=0.1, cube_mass=0.08,
-                 finger_friction=1.0, goal_yaw=0.0, reward_weights=None, render_mode=None):
-        check_arguments(task, distractors, action_mode, reward_weights, render_mode)
-        for count in (episode_steps, substeps):
-            if not isinstance(count, (int, np.integer)) or count < 1:
-                raise ValueError("episode_steps and substeps must be positive integers")
-        check_positive(timestep=timestep, action_scale=action_scale, cube_mass=cube_mass,
-                       finger_friction=finger_friction)
-        if not 0 <= goal_yaw < math.inf:
-            raise ValueError(f"goal_yaw must be a finite number >= 0, got {goal_yaw!r}")
+                 timestep=0.008, action_mode="integrated", action_scale=0.1, motor="position",
+                 cube_mass=0.08, finger_friction=1.0, goal_yaw=0.0, reward_weights=None,
+                 render_mode=None):
+        self._client = None
+        check_names(task, action_mode, motor, reward_weights, render_mode)
+        if distractors not in range(len(IDENTIFIER_POOL)):
+            raise ValueError(f"the arena holds 21 cubes: distractors must be an integer from 0 to "
+                             f"20, got {distractors!r}")
+        if not min(episode_steps, substeps, timestep, cube_mass, finger_friction) > 0:
+            raise ValueError("episode_steps, substeps, timestep, cube_mass and finger_friction "
+                             "must be positive")
         self.task, self.distractors = task, int(distractors)
         self.episode_steps, self.substeps, self.timestep = episode_steps, substeps, timestep
-        self.action_mode, self.action_scale = action_mode, action_scale
+        self.action_mode, self.action_scale, self.motor = action_mode, action_scale, motor
         self.cube_mass, self.finger_friction = cube_mass, finger_friction
         self.goal_yaw = goal_yaw
         self.reward_weights = {**REWARD_WEIGHTS, **(reward_weights or {})}
@@ -405,19 +281,22 @@ class TriFingerEnv(Env):
             pb.configureDebugVisualizer(pb.COV_ENABLE_SHADOWS, 0, **self._world)
             pb.resetDebugVisualizerCamera(0.6, 0, -40, [0, 0, 0.1], **self._world)
 
+    def __reduce__(self):
+        """TypeError: a copy would share the physics world, which lives in PyBullet."""
+        raise TypeError("a TriFingerEnv cannot be copied or pickled: make another one")
+
     # ---- building the world
 
     def _build(self):
         """Make floor, wall, robot, cubes and the goal's picture anew."""
         pb.resetSimulation(**self._world)
-        pb.setPhysicsEngineParameter(
-            fixedTimeStep=self.timestep, numSolverIterations=8, deterministicOverlappingPairs=1,
-            enableFileCaching=0,                               # or every world keeps its URDF
-            **self._world)
+        pb.setPhysicsEngineParameter(fixedTimeStep=self.timestep, numSolverIterations=ITERATIONS,
+                                     deterministicOverlappingPairs=1, **self._world)
         pb.setGravity(0, 0, -9.81, **self._world)
         self._draw_window(False)
         self._build_arena()
-        self._build_robot()
+        self._fingers = [self._build_finger(mount, yaw_quaternion(yaw))
+                         for mount, yaw in zip(FINGER_MOUNT, FINGER_YAW)]
         self._build_cubes()
         self._draw_window(True)
 
@@ -456,26 +335,52 @@ class TriFingerEnv(Env):
         for side in range(WALL_SIDES):
             angle = 2 * math.pi / WALL_SIDES * side
             middle = [(WALL + 0.01) * math.cos(angle), (WALL + 0.01) * math.sin(angle), 0.1]
-            quaternion = pb.getQuaternionFromEuler([0, 0, angle])
-            self._body(0, wall, rim, middle, quaternion)
+            self._body(0, wall, rim, middle, yaw_quaternion(angle))
 
-    def _build_robot(self):
-        """Three bodies of three joints: Bullet solves them faster than one of nine."""
-        flags = pb.URDF_USE_INERTIA_FROM_FILE
+    def _build_finger(self, mount, quaternion):
+        """One finger: a body of three joints. (Bullet solves three of them faster than one of nine
+        joints.) Only the lower link can touch things."""
+        touching = pb.createCollisionShape(
+            pb.GEOM_CAPSULE, radius=TIP, height=LINK,
+            collisionFramePosition=[0, -0.008, -LINK / 2], **self._world)
+        base, *skins = self._finger_skins()
+        finger = pb.createMultiBody(
+            0, -1, base, mount, quaternion, linkMasses=MASS,
+            linkCollisionShapeIndices=[-1, -1, touching], linkVisualShapeIndices=skins,
+            linkPositions=JOINT_PLACE, linkOrientations=[(0, 0, 0, 1)] * 3,
+            linkInertialFramePositions=CENTRE_OF_MASS,
+            linkInertialFrameOrientations=[(0, 0, 0, 1)] * 3, linkParentIndices=[0, 1, 2],
+            linkJointTypes=[pb.JOINT_REVOLUTE] * 3, linkJointAxis=JOINT_AXIS, **self._world)
+        for j in JOINTS:
+            pb.changeDynamics(finger, j, localInertiaDiagonal=INERTIA[j],
+                              lateralFriction=self.finger_friction, linearDamping=0,
+                              angularDamping=0, jointDamping=0, **self._world)
+            pb.changeDynamics(finger, j, jointLowerLimit=JOINT_LOW[j],
+                              jointUpperLimit=JOINT_HIGH[j], **self._world)
+        if self.motor == "torque":                             # Bullet's own motors off
+            pb.setJointMotorControlArray(finger, JOINTS, pb.VELOCITY_CONTROL, forces=[0] * 3,
+                                         **self._world)
+        return finger
+
+    def _finger_skins(self):
+        """Visual shapes of base, upper, middle and lower link: a bar with a ball at its joint."""
         if not self.render_mode:
-            flags |= pb.URDF_IGNORE_VISUAL_SHAPES
-        with tempfile.TemporaryDirectory() as folder:
-            path = os.path.join(folder, "finger.urdf")
-            with open(path, "w") as file:
-                file.write(finger_urdf())
-            self._fingers = [
-                pb.loadURDF(path, mount, yaw_quaternion(yaw), useFixedBase=1, flags=flags,
-                            **self._world)
-                for mount, yaw in zip(FINGER_MOUNT, FINGER_YAW)]
-        for finger in self._fingers:
-            for j in JOINTS:
-                pb.changeDynamics(finger, j, lateralFriction=self.finger_friction,
-                                  linearDamping=0, angularDamping=0, jointDamping=0, **self._world)
+            return [-1] * 4
+        bars = (((BASE, 0, 0), (0, 0, 0), 0.018, 0.018),       # from, to, radii of bar and ball
+                ((0, 0, 0), (-0.10, 0, 0), 0.017, 0.021),
+                ((0, 0, 0), KNEE, 0.013, 0.019),
+                ((0, 0, 0), TIP_PLACE, TIP, 0.016))
+        skins = []
+        for start, end, radius, ball in bars:
+            x, y, z = np.subtract(end, start)
+            length = math.hypot(x, y, z)
+            along = pb.getQuaternionFromEuler([0, math.acos(z / length), math.atan2(y, x)])
+            middle = np.add(start, end) / 2
+            skins.append(pb.createVisualShapeArray(
+                [pb.GEOM_CAPSULE, pb.GEOM_SPHERE], radii=[radius, ball], lengths=[length, 0],
+                visualFramePositions=[middle.tolist(), [0, 0, 0]],
+                visualFrameOrientations=[along, (0, 0, 0, 1)], **self._world))
+        return skins
 
     def _build_cubes(self):
         half = [CUBE / 2] * 3
@@ -512,22 +417,23 @@ class TriFingerEnv(Env):
         Where a crowd has jammed, distractors are nudged until a gap opens: in some episodes from
         N = 9 on, in nearly all at 14.
         """
+        fixed = 5                                              # fingers, goal, target: never nudged
         for _ in range(100_000):                               # a few, except in a crowd
             new = self._draw_squares(radius, yaw)
             free = self._are_free(new, placed)
             if free.any():
                 placed.append(new[free.argmax()])
                 return
-            if len(placed) > FIXED:
-                self._nudge(placed)
+            if len(placed) > fixed:
+                moved = placed.pop(int(self._np_random.integers(fixed, len(placed))))
+                placed.append(self._nudged(moved, placed))
         raise ValueError(f"the arena cannot hold {self.distractors + 1} cubes: no free place found")
 
-    def _nudge(self, placed):
-        """Move one of the distractors in `placed` a little, to wherever it is free."""
-        old = placed.pop(int(self._np_random.integers(FIXED, len(placed))))
+    def _nudged(self, square, placed):
+        """A distractor moved a little, to wherever it is free; at worst where it was."""
         steps = self._np_random.normal(size=(64, 4)) * [0.01, 0.01, 0.2, 0.0]   # m, m, rad
-        new = np.concatenate([old + steps, [old]])             # at worst: back again
-        placed.append(new[self._are_free(new, placed).argmax()])
+        new = np.concatenate([square + steps, [square]])
+        return new[self._are_free(new, placed).argmax()]
 
     def _draw_squares(self, radius, yaw, count=64):
         """(count, 4) candidates, uniform in the disc; a yaw within 45 degrees is every yaw."""
@@ -551,6 +457,8 @@ class TriFingerEnv(Env):
         bit-equal trajectories. Without a seed the bodies are only moved, so an episode then
         repeats exactly only together with those before it. `options` are ignored.
         """
+        if self._client is None:                               # Bullet would use another's world
+            raise RuntimeError("this environment is closed: make another one")
         if seed is not None:
             self._np_random = np.random.default_rng(seed)
             self._np_random_seed = seed
@@ -599,7 +507,8 @@ class TriFingerEnv(Env):
         """
         if self._steps is None:
             raise RuntimeError("call reset() before step()")
-        self._joint_targets = self._targets_after(nine_numbers(action))
+        action = nine_numbers(action)
+        self._joint_targets = self._targets_after(action)
         self._drive()
         self._steps += 1
         reason = self._read()
@@ -608,7 +517,7 @@ class TriFingerEnv(Env):
         if reason is None and self._steps >= self.episode_steps:
             reason = TIME
         before, self._moment = self._moment, self._measure()
-        rewards = self._rewards(before, self._moment)
+        rewards = self._rewards(before, self._moment, action)
         info = {"fractional_success": self._moment.rho, "rewards": rewards}
         if reason is not None:
             info["truncated_by"] = reason
@@ -620,13 +529,11 @@ class TriFingerEnv(Env):
 
     def _targets_after(self, action):
         """Joint targets (9,) in rad that an action asks for."""
-        scale = self.action_scale
         if self.action_mode == "integrated":
             # Targets that stay press on: a grip outlives the action that made it.
-            moved = [target + scale * a for target, a in zip(self._joint_targets, action)]
+            moved = [target + self.action_scale * a
+                     for target, a in zip(self._joint_targets, action)]
             targets = clip(moved, [q - LEAD for q in self._q], [q + LEAD for q in self._q])
-        elif self.action_mode == "delta":
-            targets = [q + scale * a for q, a in zip(self._q, action)]
         else:                                                  # from [-1, 1] to the joint range
             targets = [low + (high - low) * (a + 1) / 2
                        for a, low, high in zip(action, JOINT_LOW * 3, JOINT_HIGH * 3)]
@@ -635,12 +542,31 @@ class TriFingerEnv(Env):
     def _drive(self):
         """Let the physics run for one action with the joints drawn to their targets."""
         client, targets = self._client, self._joint_targets
-        for k, finger in enumerate(self._fingers):
-            pb.setJointMotorControlArray(finger, JOINTS, pb.POSITION_CONTROL,
-                                         targetPositions=targets[3 * k:3 * k + 3],
-                                         forces=(TORQUE,) * 3, physicsClientId=client)
+        if self.motor == "position":
+            gains = (GAIN * self.timestep,) * 3                # Bullet's are per physics step
+            for k, finger in enumerate(self._fingers):
+                pb.setJointMotorControlArray(
+                    finger, JOINTS, pb.POSITION_CONTROL, targetPositions=targets[3 * k:3 * k + 3],
+                    positionGains=gains, forces=(TORQUE,) * 3, physicsClientId=client)
         for _ in range(self.substeps):
+            if self.motor == "torque":
+                self._apply_torques()
             pb.stepSimulation(client)
+
+    def _apply_torques(self):
+        """CausalWorld's law, for one physics step."""
+        low, high = (-TORQUE,) * 3, (TORQUE,) * 3
+        for k, finger in enumerate(self._fingers):
+            targets = self._joint_targets[3 * k:3 * k + 3]
+            states = pb.getJointStates(finger, JOINTS, self._client)
+            q, dq, _, _ = zip(*states)
+            wanted = [KP * (target - angle) - kd * speed
+                      for target, angle, kd, speed in zip(targets, q, KD, dq)]
+            damped = [u - damping * speed
+                      for u, damping, speed in zip(clip(wanted, low, high), DAMPING, dq)]
+            pb.setJointMotorControlArray(finger, JOINTS, pb.TORQUE_CONTROL,
+                                         forces=clip(damped, low, high),
+                                         physicsClientId=self._client)
 
     def _read(self):
         """Read joints (_q, _dq) and cubes (_poses, _cube_rows) from the simulator.
@@ -701,23 +627,25 @@ class TriFingerEnv(Env):
         }
         return self._last_observation
 
-    def _rewards(self, before, now):
+    def _rewards(self, before, now, action):
         """Equation 2 (A.1) term by term, weighted; "reach" is ours.
 
             overlap     rho_t
             distance    d(o_{t-1}, g) - d(o_t, g): pays for moving closer (printed: away)
             curiosity   (1 - rho_t)^beta log(d(o_t, o_{t-1}) + 1e-5)
             reach       ||tips_{t-1} - o_{t-1}|| - ||tips_t - o_t||: pays for tips nearer the cube
+
+        `before` and `now` are Moments; no term looks at the action (9,), one of yours may.
         """
-        weights = self.reward_weights
         moved = math.dist(now.position, before.position)
         far = (1 - now.rho) ** BETA                            # about 1 until the cube is there
-        return {
-            "overlap": weights["overlap"] * now.rho,
-            "distance": weights["distance"] * (before.to_goal - now.to_goal),
-            "curiosity": weights["curiosity"] * far * math.log(moved + 1e-5),
-            "reach": weights["reach"] * (before.to_tips - now.to_tips),
+        terms = {
+            "overlap": now.rho,
+            "distance": before.to_goal - now.to_goal,
+            "curiosity": far * math.log(moved + 1e-5),
+            "reach": before.to_tips - now.to_tips,
         }
+        return {name: self.reward_weights[name] * term for name, term in terms.items()}
 
     def _diverged(self):
         """Last step of an episode whose state is no longer numbers: the next reset builds anew."""
@@ -729,10 +657,14 @@ class TriFingerEnv(Env):
     # ---- pictures
 
     def _paint(self):
-        """Move the goal's picture and colour the cubes: target blue, distractors red (figure 1)."""
+        """Show the goal, and colour the bodies (figure 1: target blue, distractors red)."""
         for i, cube in enumerate(self._cubes):
             color = [0.15, 0.35, 0.9, 1] if i == self.target else [0.85, 0.2, 0.2, 1]
             pb.changeVisualShape(cube, -1, rgbaColor=color, **self._world)
+        orange, metal, plastic = (0.95, 0.55, 0.15, 1), (0.45, 0.47, 0.52, 1), (0.2, 0.2, 0.23, 1)
+        for finger in self._fingers:
+            for link, color in zip((-1, *JOINTS), (metal, plastic, metal, orange)):
+                pb.changeVisualShape(finger, link, rgbaColor=color, **self._world)
         self._show_goal(*self.goal)
 
     def _show_goal(self, position, quaternion=(0, 0, 0, 1)):
@@ -764,100 +696,47 @@ class TriFingerEnv(Env):
         return np.reshape(image, (height, width, 4))[:, :, :3].astype(np.float32)
 
     def close(self):
-        """Disconnect from PyBullet; calling it twice is harmless."""
+        """Disconnect from PyBullet; calling it twice is harmless, any other use then an error."""
         if self._client is not None:
             pb.disconnect(self._client)
-            self._client = None
+        self._client = self._steps = None
 
 
-def check_arguments(task, distractors, action_mode, reward_weights, render_mode):
-    """ValueError with one line if TriFingerEnv cannot be built from these."""
-    most = len(IDENTIFIER_POOL) - 1
-    is_integer = isinstance(distractors, (int, np.integer)) and not isinstance(distractors, bool)
+def check_names(task, action_mode, motor, reward_weights, render_mode):
+    """ValueError with one line if one of TriFingerEnv's words is none that it knows."""
+    for name, got, known in (("task", task, ("push", "lift")),
+                             ("action_mode", action_mode, ("integrated", "absolute")),
+                             ("motor", motor, ("position", "torque")),
+                             ("render_mode", render_mode, (None, "rgb_array", "human"))):
+        if got not in known:
+            raise ValueError(f"{name} must be one of {known}, got {got!r}")
     unknown = set(reward_weights or {}) - set(REWARD_WEIGHTS)
-    if task not in ("push", "lift"):
-        raise ValueError(f"task must be 'push' or 'lift', got {task!r}")
-    if not is_integer or not 0 <= distractors <= most:
-        raise ValueError(f"the arena holds {most + 1} cubes: distractors must be an integer from 0 "
-                         f"to {most}, got {distractors!r}")
-    if action_mode not in ("integrated", "delta", "absolute"):
-        raise ValueError(f"action_mode must be 'integrated', 'delta' or 'absolute', "
-                         f"got {action_mode!r}")
     if unknown:
         raise ValueError(f"reward_weights knows {list(REWARD_WEIGHTS)}, got {sorted(unknown)}")
-    if render_mode not in (None, "rgb_array", "human"):
-        raise ValueError(f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}")
     if render_mode == "human" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
         raise ValueError("a window needs a screen, and DISPLAY is not set; 'rgb_array' needs none")
 
 
-def check_positive(**numbers):
-    """ValueError with one line if one of the numbers is not above 0."""
-    for name, number in numbers.items():
-        if not number > 0:
-            raise ValueError(f"{name} must be positive, got {number!r}")
-
-
 def nine_numbers(action):
     """The action as nine floats in [-1, 1]; ValueError if it is not nine finite numbers."""
-    try:
-        array = np.asarray(action, dtype=np.float64)
-        numbers = array.tolist()
-        is_right = array.shape == (9,) and all(map(math.isfinite, numbers))
-    except (TypeError, ValueError):      # no numbers at all
-        is_right = False
-    if not is_right:
+    array = np.asarray(action, dtype=np.float64)
+    numbers = array.tolist()
+    if array.shape != (9,) or not all(map(math.isfinite, numbers)):
         raise ValueError(f"action must be nine finite numbers, shape (9,), got {action!r}")
     return clip(numbers, (-1.0,) * 9, (1.0,) * 9)
 
 
-# ---- speed
-
-def timed_episode(env, actions, physics):
-    """Seconds of an unseeded reset and of all steps together."""
-    clock = time.perf_counter
-    start = clock()
-    env.reset()
-    reset = clock() - start
-    physics.clear()
-    spent = 0.0
-    for action in actions:
-        start = clock()
-        env.step(action)
-        spent += clock() - start
-    return reset, spent
-
-
-def speed_table(episodes=21, steps=100):
-    """Frames/s under random actions, medians over episodes.
-
-    "step/physics": the time of step() over that of the bare stepSimulation inside the very same
-    steps. "reset/step": a reset counted in steps.
-    """
-    bare, physics = pb.stepSimulation, []
-
-    def timed(client):
-        start = time.perf_counter()
-        bare(client)
-        physics.append(time.perf_counter() - start)
-
-    pb.stepSimulation = timed
-    rng = np.random.default_rng(0)
-    print("   N  control        frames/s  step/physics  reset/step")
-    for substeps, timestep in ((5, 0.008), (3, 0.004)):
-        for distractors in (0, 2, 5, 9):
-            env = TriFingerEnv(distractors=distractors, substeps=substeps, timestep=timestep)
-            env.reset(seed=0)
-            rows = []
-            for actions in rng.uniform(-1, 1, (episodes, steps, 9)):
-                reset, spent = timed_episode(env, actions, physics)
-                rows.append((steps / spent, spent / sum(physics), reset / spent * steps))
-            env.close()
-            rate, ratio, resets = np.median(rows, axis=0)
-            print(f"{distractors:4d}  {substeps} x {1000 * timestep:.0f} ms {rate:13.0f} "
-                  f"{ratio:13.2f} {resets:11.1f}")
-    pb.stepSimulation = bare
+if gymnasium is not None:                # gymnasium.make("TriFingerLift-v0", distractors=2)
+    gymnasium.register("TriFingerPush-v0", TriFingerEnv, kwargs={"task": "push"})
+    gymnasium.register("TriFingerLift-v0", TriFingerEnv, kwargs={"task": "lift"})
 
 
 if __name__ == "__main__":
-    speed_table()
+    env = TriFingerEnv("push", distractors=2)
+    observation, info = env.reset(seed=0)
+    print({key: value.shape for key, value in observation.items()})
+    rng, begin, truncated = np.random.default_rng(0), time.perf_counter(), False
+    while not truncated:
+        observation, reward, _, truncated, info = env.step(rng.uniform(-1, 1, 9))
+    rate = env.episode_steps / (time.perf_counter() - begin)
+    print(f"{info}\n{rate:.0f} frames/s")
