@@ -271,15 +271,16 @@ def reseed(learner, seed, update, rank):
 
 # ---- files of a run
 
-def load(path):
-    """Checkpoint dict of a run folder (or of a file), and its agent.
+def load(source):
+    """Checkpoint dict, and its agent, of a run folder, a checkpoint's path or an open file.
 
     A setting that the checkpoint lacks takes its default. ValueError in one line if it is not a
     checkpoint of ours.
     """
-    path = os.path.join(path, "checkpoint.pt") if os.path.isdir(path) else path
+    if isinstance(source, str) and os.path.isdir(source):
+        source = os.path.join(source, "checkpoint.pt")
     try:
-        checkpoint = torch.load(path, weights_only=True, map_location="cpu")
+        checkpoint = torch.load(source, weights_only=True, map_location="cpu")
         checkpoint["settings"] = {**DEFAULTS, **checkpoint["settings"]}
         agent = Agent(checkpoint["encoder"], checkpoint["distractors"], checkpoint["settings"])
         prefix = "agent."
@@ -288,7 +289,7 @@ def load(path):
                                if name.startswith(prefix)})
     except Exception as error:           # torch.load raises many kinds; the user needs one line
         reason = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path} is not a readable checkpoint of train.py "
+        raise ValueError(f"{source} is not a readable checkpoint of train.py "
                          f"({type(error).__name__}: {reason})") from None
     return checkpoint, agent.eval()      # for an encoder of your own, with dropout, say
 
