@@ -58,7 +58,7 @@ ENV = {
     "action_scale": Setting(0.1, 0.1, "rad, largest step of a joint target; absolute: not used"),
     "motor": Setting("position", "torque", "CW's torque law; at 8 ms resting joints shake"),
     "cube_mass": Setting(0.08, 0.02, "kg; CW's pushing and picking tasks: 0.02"),
-    "finger_friction": Setting(1.0, 0.1, "IsaacGymEnvs; CW: 0.1, which holds no 0.08 kg"),
+    "finger_friction": Setting(1.0, 0.5, "IsaacGymEnvs; CW asks for 0.1, PyBullet keeps 0.5"),
     "goal_yaw": Setting(0.0, math.pi / 4, "largest yaw, rad; 0: only the place counts (4.1: pose)"),
 }
 # A.1: alpha_1, alpha_2 (2 mm are worth 0.5; ours: 10), alpha_3 (a penalty, smaller for a fast cube;
@@ -321,10 +321,13 @@ class Run:
 
     def open(self):
         """Make the folder ready: progress.csv with the rows up to the checkpoint."""
-        lines = [",".join(PROGRESS) + "\n"]
         if self.args.checkpoint:
             with open(self.path("progress.csv")) as file:
                 lines = file.readlines()[:1 + self.update]
+        else:                            # of an overwritten run nothing is left
+            lines = [",".join(PROGRESS) + "\n"]
+            for old in glob.glob(self.path("zeroshot*.csv")) + glob.glob(self.path("*.pt")):
+                os.remove(old)
         replace(self.path("progress.csv"), "".join(lines).encode())
 
     def write(self, row, elapsed):
@@ -492,7 +495,7 @@ def resume(args, given):
     """The command of the run to go on with: all of it stands in the checkpoint."""
     if given not in (["--resume", args.resume], [f"--resume={args.resume}"]):
         fail("--resume RUN takes no other option: a run goes on as it was started")
-    if not os.path.isdir(args.resume):
+    if not os.path.exists(os.path.join(args.resume, "progress.csv")):
         fail(f"--resume {args.resume}: no such run folder")
     try:
         checkpoint, _ = load(args.resume)
@@ -528,7 +531,9 @@ def stop_on_ctrl_c(folder, rank):
     """Ctrl-C ends the process at once: the folder is always as of the last whole update."""
     def stop(*_):
         if rank == 0:
-            os.write(2, f"\nstopped; python train.py --resume {folder} goes on\n".encode())
+            saved = os.path.exists(os.path.join(folder, "checkpoint.pt"))
+            goes_on = f"python train.py --resume {folder} goes on" if saved else "nothing is saved"
+            os.write(2, f"\nstopped; {goes_on}\n".encode())
         os._exit(STOPPED)
 
     signal.signal(signal.SIGINT, stop)

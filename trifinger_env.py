@@ -33,12 +33,10 @@ WALL_SIDES = 12                          # the round wall is made of so many box
 GRASP_RADIUS = 0.124                     # inside it a finger can get behind a cube, m
 OUTSIDE, BELOW, ABOVE = WALL + 0.03, -0.03, 1.0                # beyond them a cube has left, m
 CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multiplies those in touch
-# A cube's mass and the fingers' friction are arguments, because sources differ:
-#   CausalWorld (the paper's simulator)   0.08 kg (its pushing and picking tasks: 0.02), friction
-#                                         0.1, too little to hold 0.08 kg
-#   trifinger_simulation                  0.08 kg, friction 0.5
-#   IsaacGymEnvs, and we                  0.08 kg, friction 1.0
-# A real cube weighs 0.094 kg.
+# Sources differ in a cube's mass and the fingers' friction: CausalWorld (the paper's simulator) has
+# 0.02 kg in its pushing task, else 0.08, and 0.5 (it asks for 0.1, but PyBullet gives that to the
+# fingers' bases, which touch nothing); trifinger_simulation 0.08 kg and 0.5; IsaacGymEnvs, and we,
+# 0.08 kg and 1.0. A real cube weighs 0.094 kg.
 IDENTIFIER_POOL = np.linspace(-1.0, 1.0, 21)                   # none is new when N grows
 HIGHEST_GOAL = 0.2                       # height of the centre of the highest goal in lifting, m
 ITERATIONS = 16                          # of Bullet's solver: with fewer, grips slip (tested)
@@ -46,13 +44,14 @@ ITERATIONS = 16                          # of Bullet's solver: with fewer, grips
 # The robot: three fingers of three joints each, upper, middle and lower
 JOINTS = (0, 1, 2)
 BASE = 0.0455                            # radius at which fingers are mounted, m
-HEIGHT = 0.34                            # height at which fingers are mounted, m
+HEIGHT = 0.329                           # of the fingers' mounts, m: 0.34 in CausalWorld, whose
+                                         # floor lies at 0.011
 LINK = 0.16                              # length of the middle and the lower link, m
 TIP = 0.0095                             # radius of a finger's lower link and tip, m
 TIP_HALF_EDGE = 0.014                    # of the square that a tip at rest keeps free of cubes, m
 JOINT_LOW = (-1.57, -1.2, -3.0)          # limits of upper, middle and lower joint, rad
 JOINT_HIGH = (1.0, 1.57, 3.0)
-REST = (0.0, 0.55, -0.7)                 # at reset, rad: tips hang beside the cubes, 0.045 m high
+REST = (0.0, 0.55, -0.7)                 # at reset, rad: tips hang beside the cubes, 0.034 m high
 LEAD = 0.25                              # rad, how far an integrated target may lead its joint
 FINGER_YAW = [-math.radians(90 + 120 * k) for k in range(3)]   # heading of finger k
 FINGER_MOUNT = [(-BASE * math.cos(yaw), -BASE * math.sin(yaw), HEIGHT) for yaw in FINGER_YAW]
@@ -215,15 +214,14 @@ class Moment(NamedTuple):
 class TriFingerEnv(Env):
     """PushingCube (task="push") or LiftingCube (task="lift") with `distractors` + 1 cubes.
 
-    distractors     N, 0 to 20. ValueError beyond what the arena and the pool of identifiers hold.
+    distractors     N, 0 to 20
     episode_steps   actions in an episode; the same for every N, or N would change the task
     substeps, timestep   physics steps per action and their length in s: the control rate is
                     1 / (substeps * timestep), 25 Hz by default. The paper's 83.3 Hz and 30 s:
                     episode_steps=2500, substeps=3, timestep=0.004.
-    action_mode     "integrated": joint target = last target + action_scale * action, so that a zero
-                    action keeps a grip; at most LEAD away from the measured angle;
-                    "absolute": the action spans the joint range.
-    action_scale    largest step of a joint target, rad; without effect on "absolute"
+    action_mode     "integrated": joint target = last target + action_scale * action (rad), so that
+                    a zero action keeps a grip; at most LEAD away from the measured angle;
+                    "absolute": the action spans the joint range, action_scale has no effect
     motor           what draws the joints to their targets: "position", Bullet's motor, or "torque",
                     CausalWorld's law, anew in every physics step (it needs steps of 4 ms)
     cube_mass       kg
@@ -232,11 +230,11 @@ class TriFingerEnv(Env):
     reward_weights  weights that replace those of REWARD_WEIGHTS, by name (equation 2, A.1)
     render_mode     None, "rgb_array" (headless), or "human" (PyBullet's window, in real time)
 
-    info holds fractional_success (axis-aligned, as in CausalWorld) and rewards, each weighted term
-    by name; they add up to the reward. At an episode's last step it also holds
-    fractional_success_strict (oriented) and truncated_by: "time", "a cube left the arena", or "the
-    physics diverged" (then with the last sound observation, reward 0 and success 0). An episode
-    never terminates, it is truncated. It counts as solved at rho >= 0.8.
+    info holds fractional_success (axis-aligned, as in CausalWorld) and rewards, the weighted terms,
+    which add up to the reward. At an episode's last step it also holds fractional_success_strict
+    (oriented) and truncated_by: "time", "a cube left the arena", or "the physics diverged" (then
+    with the last sound observation, reward 0 and success 0). An episode never terminates, it is
+    truncated. ValueError, in one line, for arguments that it does not know.
     """
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 25}
 
@@ -293,17 +291,10 @@ class TriFingerEnv(Env):
         pb.setPhysicsEngineParameter(fixedTimeStep=self.timestep, numSolverIterations=ITERATIONS,
                                      deterministicOverlappingPairs=1, **self._world)
         pb.setGravity(0, 0, -9.81, **self._world)
-        self._draw_window(False)
         self._build_arena()
         self._fingers = [self._build_finger(mount, yaw_quaternion(yaw))
                          for mount, yaw in zip(FINGER_MOUNT, FINGER_YAW)]
         self._build_cubes()
-        self._draw_window(True)
-
-    def _draw_window(self, on):
-        """Stop PyBullet's window from drawing every body that is added, or let it draw again."""
-        if self.render_mode == "human":
-            pb.configureDebugVisualizer(pb.COV_ENABLE_RENDERING, int(on), **self._world)
 
     def _skin(self, color, half_extents, **place):
         """Visual shape of a box; without pictures -1, none, which makes building twice as fast."""
@@ -452,10 +443,9 @@ class TriFingerEnv(Env):
     def reset(self, *, seed=None, options=None):
         """Start an episode. Returns (observation, info with fractional_success).
 
-        With a `seed` the generator restarts and the world is built anew (about 5 ms), because
-        moving bodies in place leaves traces in Bullet's caches: two resets with one seed give
-        bit-equal trajectories. Without a seed the bodies are only moved, so an episode then
-        repeats exactly only together with those before it. `options` are ignored.
+        With a `seed` the world is built anew (about 5 ms), because moving bodies in place leaves
+        traces in Bullet's caches: two resets with one seed give bit-equal trajectories. Without a
+        seed an episode repeats exactly only together with those before it.
         """
         if self._client is None:                               # Bullet would use another's world
             raise RuntimeError("this environment is closed: make another one")

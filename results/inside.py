@@ -1,16 +1,18 @@
-"""Look inside trained agents: the numbers behind figures 6, 7 and 8 (the paper's appendix).
+"""Look inside trained agents in the episodes that evaluate.py plays.
 
-    python results/inside.py                    all that the shipped runs allow
-    python results/inside.py 8 --episodes 20    one of them, from fewer episodes
+    python results/inside.py RUN --distractors 0,2,9     a table by N
+    python results/inside.py RUN --crowd 10-15           read error among 10 to 15 distractors
+    python results/inside.py --figures                   the numbers of figures 6, 7 and 8
 
-Plays episodes with the shipped runs push-{lrn,rn,attn}-n2-seed0 and writes beside this file
-
-    figure6.csv         z at each N, embedded in the plane by t-SNE: encoder, distractors, x, y
-    figure6-drift.csv   how far the z at each N are from those at 2: encoder, distractors, distance
-    figure7.csv         LRN's relations at N = 3..6, embedded in the plane: kind, x, y
-    figure8.csv         LRN's relations at N = 4 and 5: mean norm by kind and step
-
-t-SNE needs scikit-learn. Episodes and actions are those of evaluate.py.
+The table: success; the same where the way from target to goal was clear and where a distractor
+blocked it; share of blocked ones; distance from the target cube to where the read-out sees it;
+drift of z from z at the N of training; for LRN the length of the distractors' mean relation against
+the target's; for lifting success by the goal's height. All but success are of the start.
+A crowd is made of scenes at the N of training, as Agent.crowd makes it, so its read error judges
+the transfer without a look at a test N.
+--figures plays results/runs/push-{lrn,rn,attn}-n2-seed0 and writes figure6.csv (z at each N in the
+plane), figure6-drift.csv (distance of the z at N from those at 2), figure7.csv (LRN's relations in
+the plane) and figure8.csv (their lengths) in results/. Needs scikit-learn.
 """
 import argparse
 import csv
@@ -23,61 +25,148 @@ import torch
 HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path.insert(0, os.path.dirname(HERE))
 import evaluate
-from figures import KINDS, PAPER
-from train import Agent, fail, load, positive
-from trifinger_env import TIME
+from lrn import LRN
+from train import POOL, Agent, fail, load, make_env
+from trifinger_env import CUBE, IDENTIFIER, POSITION, POSITION_SCALE
 
-MOMENTS = 5                              # of an episode that t-SNE gets to see
+BANDS = ((0, 5), (5, 10), (10, 15), (15, 20))                  # of a lifting goal's height, cm
+KINDS = ("finger 0", "finger 1", "finger 2", "target")         # of relations, then distractors
 POINTS = 5000                            # most points that t-SNE and distances are given
-FIRST_DISTRACTOR = 4                     # index among relations_of(): after fingers and target
+MOMENTS = 5                              # of an episode that t-SNE gets to see
 
 
 # ---- playing
 
-@torch.inference_mode()
-def record(run, distractors, episodes, measure):
-    """measure(agent, obs) -> (B, ...) after every step of `episodes`: (steps, E, ...)."""
-    checkpoint, agent = load(run)
-    records = []
-    for part in evaluate.chunks(episodes):
-        envs, observations = evaluate.start(checkpoint, distractors, part)
-        steps = []
-        for _ in range(checkpoint["settings"]["episode_steps"]):
-            actions = evaluate.actions(agent, observations)
-            played = [env.step(action) for env, action in zip(envs, actions)]
-            refuse_if_cut_short(played)
-            observations = [obs for obs, *_ in played]
-            steps.append(measure(agent, evaluate.as_batch(observations)).numpy())
-        records.append(np.stack(steps))
-        for env in envs:
-            env.close()
-    return np.concatenate(records, axis=1)
+def batch_of(observations):
+    """Observations as one batch, in every scene the target as first cube."""
+    obs = evaluate.as_batch(observations)
+    is_other = obs["cubes"][..., IDENTIFIER] != obs["goal"][:, None, IDENTIFIER]       # (B, N+1)
+    order = is_other.int().argsort(dim=1, stable=True)
+    obs["cubes"] = obs["cubes"][torch.arange(len(order))[:, None], order]
+    return obs
 
 
-def refuse_if_cut_short(played):
-    """ValueError if an episode ended before its time: it would have fewer steps than others."""
-    for *_, truncated, info in played:
-        if truncated and info["truncated_by"] != TIME:
-            raise ValueError(f"an episode was cut short ({info['truncated_by']})")
+def starts(checkpoint, N, episodes):
+    """The first observations of the episodes, as one batch."""
+    env = make_env(checkpoint["task"], N, checkpoint["settings"])
+    seeds = [evaluate.episode_seed(episode) for episode in range(episodes)]
+    return batch_of([env.reset(seed=seed)[0] for seed in seeds])
+
+
+def record(encoder, N, episodes, measure):
+    """measure(agent, obs) -> (B, ...) after every step of a shipped run: (steps, episodes, ...)."""
+    checkpoint, agent = load(os.path.join(HERE, "runs", f"push-{encoder}-n2-seed0"))
+    env = make_env("push", N, checkpoint["settings"])
+    measured = []
+    for episode in range(episodes):
+        obs, _ = env.reset(seed=evaluate.episode_seed(episode))
+        played = []
+        for _ in range(env.episode_steps):
+            [action] = evaluate.actions(agent, [obs])
+            obs, *_ = env.step(action)
+            played.append(obs)
+        measured.append(measure(agent, batch_of(played)))
+    return torch.stack(measured, dim=1).numpy()
+
+
+# ---- measures in B scenes, the target as first cube
+
+def is_blocked(obs):
+    """(B,) bool: does a distractor lie within a cube's width of the line from target to goal?"""
+    places = obs["cubes"][..., POSITION][..., :2] * POSITION_SCALE         # (B, N+1, 2), m
+    goal = obs["goal"][:, POSITION][:, :2] * POSITION_SCALE                # (B, 2)
+    way = (goal - places[:, 0])[:, None]                       # (B, 1, 2)
+    to_others = places[:, 1:] - places[:, :1]                  # (B, N, 2)
+    share = (to_others * way).sum(2) / way.square().sum(2)     # (B, N), of the way
+    nearest = share.clamp(0, 1)[..., None] * way               # (B, N, 2)
+    return ((to_others - nearest).norm(dim=2) < CUBE).any(1)
+
+
+def read_error(agent, obs):
+    """Mean distance in mm from the target cube to where the read-out sees it."""
+    seen = agent.read_out(agent.encode(obs))[:, :3]
+    away = (seen - obs["cubes"][:, 0, POSITION]).norm(dim=1)
+    return 1000 * POSITION_SCALE * away.mean()
+
+
+def drift_of(z, z_trained):
+    """Mean distance of z (B, Z) from z_trained, in units of that between two rows of z_trained."""
+    # Identifiers and a lifting goal's height differ at another N, and move z, too.
+    B = len(z)
+    spread = torch.cdist(z_trained, z_trained).sum() / (B * (B - 1))
+    return (z - z_trained).norm(dim=1).mean() / spread
 
 
 def relations_of(agent, obs):
     """LRN's relations, fingers first, then the target, then distractors: (B, K, D)."""
-    objects, goal = agent.tokens(obs)
-    r = agent.encoder.relations(objects, goal)                 # (B, K, D), cubes first
-    is_target = evaluate.is_target(obs)
-    count = is_target.shape[1]
-    fingers, target = r[:, count:], r[:, :count][is_target]
-    others = r[:, :count][~is_target].view(len(r), count - 1, -1)
-    return torch.cat([fingers, target[:, None], others], dim=1)
+    return agent.encoder.relations(*agent.tokens(obs)).roll(3, dims=1)     # fingers were last
 
 
-# ---- measures
+# ---- the tables
+
+def by_number(checkpoint, agent, N, episodes):
+    """A row of the table by N: {column: number}."""
+    ends = []
+    for first in range(0, episodes, evaluate.CHUNK):
+        part = range(episodes)[first:first + evaluate.CHUNK]
+        ends += evaluate.play(checkpoint, agent, N, part)
+    success = torch.tensor([end["fractional_success"] for end in ends])
+    obs = starts(checkpoint, N, episodes)
+    trained = starts(checkpoint, checkpoint["distractors"], episodes)
+    blocked = is_blocked(obs)
+    row = {
+        "N": N,
+        "success": success.mean(),
+        "way clear": success[~blocked].mean(),
+        "way blocked": success[blocked].mean(),
+        "share blocked": blocked.float().mean(),
+        "read error, mm": read_error(agent, obs),
+        "drift of z": drift_of(agent.encode(obs), agent.encode(trained)),
+    }
+    if isinstance(agent.encoder, LRN):
+        r = relations_of(agent, obs)
+        row["relations"] = r[:, 4:].mean((0, 1)).norm() / r[:, 3].mean(0).norm()
+    if checkpoint["task"] == "lift":
+        height = 100 * POSITION_SCALE * obs["goal"][:, POSITION][:, 2]     # cm
+        for low, high in BANDS:
+            row[f"{low}-{high} cm"] = success[(height >= low) & (height < high)].mean()
+    return row
+
+
+def by_crowd(checkpoint, agent, M, episodes):
+    """A row of the table by crowd: M of a scene's distractors, drawn with replacement."""
+    obs = starts(checkpoint, checkpoint["distractors"], episodes)
+    B, count = obs["cubes"].shape[:2]
+    if count == 1 or M >= len(POOL):
+        raise ValueError(f"no crowd of {M}: it takes distractors in training, and at most 20")
+    others = torch.randint(1, count, (B, M))
+    drawn = torch.cat([torch.zeros(B, 1, dtype=int), others], dim=1)       # the target first
+    obs["cubes"] = obs["cubes"][torch.arange(B)[:, None], drawn]           # (B, M+1, 18)
+    identifiers = POOL[torch.rand(B, len(POOL)).argsort(dim=1)[:, :M + 1]]
+    obs["cubes"][..., IDENTIFIER] = identifiers
+    obs["goal"][:, IDENTIFIER] = identifiers[:, 0]
+    return {"crowd": M, "read error, mm": read_error(agent, obs)}
+
+
+def print_table(run, args):
+    checkpoint, agent = load(run)
+    print(run)
+    torch.manual_seed(0)
+    look, numbers = (by_crowd, args.crowd) if args.crowd else (by_number, args.distractors)
+    for number in numbers:
+        row = look(checkpoint, agent, number, args.episodes)
+        if number == numbers[0]:
+            print("  ".join(f"{name:>7s}" for name in row))
+        print("  ".join(f"{value:{max(len(name), 7)}.3g}" for name, value in row.items()),
+              flush=True)
+
+
+# ---- numbers of the figures
 
 def energy_distance(a, b):
-    """Distance of two clouds of points (n, Z), (m, Z), in units of the distances within b.
+    """Distance of two clouds of points (n, Z), (m, Z): 0 for equal distributions (Szekely, 2003).
 
-    (2 E|a - b| - E|a - a'| - E|b - b'|) / E|b - b'| (Szekely, 2003): 0 for equal distributions.
+    (2 E|a - b| - E|a - a'| - E|b - b'|) / E|b - b'|
     """
     a, b = torch.from_numpy(a), torch.from_numpy(b)
     within = torch.cdist(b, b).mean()
@@ -86,17 +175,7 @@ def energy_distance(a, b):
 
 def some(points, count):
     """At most `count` rows, drawn without repetition."""
-    rows = np.random.default_rng(0).permutation(len(points))[:count]
-    return points[rows]
-
-
-def tsne():
-    """scikit-learn's t-SNE into the plane; asked for before anything is played."""
-    try:
-        from sklearn.manifold import TSNE
-    except ImportError:
-        raise ValueError("figures 6 and 7 need scikit-learn: pip install scikit-learn") from None
-    return TSNE(random_state=0)
+    return points[np.random.default_rng(0).permutation(len(points))[:count]]
 
 
 def moments(steps):
@@ -105,83 +184,77 @@ def moments(steps):
     return steps[at].reshape(-1, *steps.shape[2:])
 
 
-# ---- the figures' numbers
+def write(name, columns, rows):
+    """A CSV in results/; floats with three decimals."""
+    texts = [[f"{cell:.3f}" if isinstance(cell, float) else cell for cell in row] for row in rows]
+    with open(os.path.join(HERE, name), "w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([columns, *texts])
+    print(f"wrote {name}", flush=True)
 
-def figure_6(episodes):
+
+def embedded(labels, points):
+    """Labels (tuples), each with the place of its point (n, Z) in the plane by t-SNE."""
+    from sklearn.manifold import TSNE
+    places = TSNE(random_state=0).fit_transform(points).tolist()
+    return [(*label, x, y) for label, (x, y) in zip(labels, places)]
+
+
+def figure_6(episodes, numbers=range(10)):
     """z by N, encoder by encoder."""
-    embedding = tsne()
     dots, drifts = [], []
-    for encoder in PAPER:
-        run = os.path.join(HERE, f"push-{encoder}-n2-seed0")
-        if not os.path.exists(run):
-            print(f"figure 6 without {encoder}: {run} is not there")
-            continue
-        numbers = range(10)
-        steps = {N: record(run, N, episodes, Agent.encode) for N in numbers}
-        whole = {N: some(z.reshape(-1, z.shape[-1]), POINTS) for N, z in steps.items()}
-        drifts += [(encoder, N, f"{energy_distance(whole[N], whole[2]):.4f}") for N in numbers]
-        sample = {N: some(moments(z), POINTS // len(numbers)) for N, z in steps.items()}
-        places = embedding.fit_transform(np.concatenate(list(sample.values())))
-        labels = [N for N in numbers for _ in sample[N]]
-        dots += [(encoder, N, f"{x:.2f}", f"{y:.2f}") for N, (x, y) in zip(labels, places)]
+    for encoder in ("lrn", "rn", "attn"):
+        z = {N: record(encoder, N, episodes, Agent.encode) for N in numbers}
+        clouds = {N: some(z[N].reshape(-1, z[N].shape[-1]), POINTS) for N in numbers}
+        drifts += [(encoder, N, energy_distance(clouds[N], clouds[2])) for N in numbers]
+        samples = {N: some(moments(z[N]), POINTS // len(numbers)) for N in numbers}
+        labels = [(encoder, N) for N in numbers for _ in samples[N]]
+        dots += embedded(labels, np.concatenate(list(samples.values())))
     write("figure6.csv", ("encoder", "distractors", "x", "y"), dots)
     write("figure6-drift.csv", ("encoder", "distractors", "distance"), drifts)
 
 
-def figure_7(episodes):
+def figure_7(episodes, numbers=range(3, 7)):
     """LRN's relations by kind, in the plane."""
-    embedding = tsne()
-    run = os.path.join(HERE, "push-lrn-n2-seed0")
-    rows, kinds = [], []
-    numbers = range(3, 7)
+    points, labels = [], []
     for N in numbers:
-        r = moments(record(run, N, episodes, relations_of))    # (n, K, D)
+        r = moments(record("lrn", N, episodes, relations_of))  # (n, K, D)
         r = some(r, POINTS // (len(numbers) * r.shape[1]))     # as many points at every N, about
-        rows += list(r.reshape(-1, r.shape[-1]))
-        of_one_state = [*list(KINDS)[:FIRST_DISTRACTOR], *["distractors"] * N]
-        kinds += of_one_state * len(r)
-    places = embedding.fit_transform(np.array(rows))
-    write("figure7.csv", ("kind", "x", "y"),
-          [(kind, f"{x:.2f}", f"{y:.2f}") for kind, (x, y) in zip(kinds, places)])
+        points += list(r.reshape(-1, r.shape[-1]))
+        labels += [(kind,) for kind in (*KINDS, *["distractors"] * N)] * len(r)
+    write("figure7.csv", ("kind", "x", "y"), embedded(labels, np.array(points)))
 
 
 def figure_8(episodes):
-    """Norms of LRN's relations by kind over an episode; of distractors, the mean of their norms."""
-    run = os.path.join(HERE, "push-lrn-n2-seed0")
+    """Lengths of LRN's relations by kind over an episode; of distractors, their mean."""
     rows = []
     for N in (4, 5):
-        r = record(run, N, episodes, relations_of)             # (steps, E, K, D)
-        norms = np.linalg.norm(r, axis=-1).mean(axis=1)        # (steps, K)
-        for step, row in enumerate(norms, 1):
-            values = [*row[:FIRST_DISTRACTOR], row[FIRST_DISTRACTOR:].mean()]
-            rows.append((N, step, *(f"{value:.3f}" for value in values)))
-    write("figure8.csv", ("N", "step", *KINDS), rows)
-
-
-def write(name, columns, rows):
-    path = os.path.join(HERE, name)
-    with open(path, "w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([columns, *rows])
-    print(f"wrote {path}")
-
-
-FIGURES = {"8": figure_8, "6": figure_6, "7": figure_7}        # 8 needs no scikit-learn
+        r = record("lrn", N, episodes, relations_of)           # (steps, E, K, D)
+        lengths = np.linalg.norm(r, axis=-1).mean(axis=1)      # (steps, K)
+        for step, row in enumerate(lengths.tolist(), 1):
+            rows.append((N, step, *row[:4], sum(row[4:]) / N))
+    write("figure8.csv", ("N", "step", *KINDS, "distractors"), rows)
 
 
 def main():
-    parser = argparse.ArgumentParser(description="Numbers behind figures 6, 7 and 8.")
+    parser = argparse.ArgumentParser(description="Look inside agents (see the top of inside.py).")
     parser.error = fail
-    parser.add_argument("figures", nargs="*", help=f"of {', '.join(FIGURES)} (default: all)")
-    parser.add_argument("--episodes", type=positive, default=200, metavar="E", help="default 200")
+    add = parser.add_argument
+    add("runs", nargs="*", metavar="RUN")
+    add("--distractors", type=evaluate.numbers, default=[0, 2, 5, 9], metavar="LIST",
+        help="N of the table, default 0,2,5,9")
+    add("--crowd", type=evaluate.numbers, metavar="LIST", help="sizes of crowds, as 10-15")
+    add("--episodes", type=evaluate.positive, default=200, metavar="E", help="default 200")
+    add("--figures", action="store_true", help="write the CSVs of figures 6, 7 and 8")
     args = parser.parse_args()
-    for figure in args.figures:
-        if figure not in FIGURES:
-            fail(f"there is no figure {figure} here; there are {', '.join(FIGURES)}")
     torch.set_num_threads(1)
+    torch.set_grad_enabled(False)
     try:
-        for figure in args.figures or FIGURES:
-            FIGURES[figure](range(args.episodes))
-    except (ValueError, OSError) as error:
+        for run in args.runs:
+            print_table(run, args)
+        if args.figures:
+            for figure in (figure_8, figure_7, figure_6):      # the quick ones first
+                figure(args.episodes)
+    except ValueError as error:
         fail(str(error))
 
 

@@ -1,211 +1,90 @@
 #!/usr/bin/env bash
-# Train and evaluate the runs behind the figures and tables of this folder (but
-# unfinished/push-lrn-n2-paper-seed1 and the untrained agents: see probe.txt and thrown.txt).
+# Train, evaluate and ship the runs behind the figures of this folder.
 #
-#   results/reproduce.sh --list              every run and how far it is
+#   results/reproduce.sh --list              every run: done, begun or missing
 #   results/reproduce.sh                     whatever is left, one run after the other
-#   results/reproduce.sh --jobs 2 push       runs with "push" in their names, two side by side
+#   results/reproduce.sh --jobs 2 n2-seed0   runs whose names match, two side by side
 #
-# A run trains on one rank in runs/NAME (log: runs/NAME.log), is then played at other N, and a copy
-# without ballast goes to results/NAME. Stop with Ctrl-C: the next call goes on where it stopped.
-# A run is done when results/NAME/zeroshot.csv is there; to train a shipped one anew, remove
-# results/NAME and runs/NAME first. LRN's runs of figure 3 are also played recentred.
+# A run trains in runs/NAME (log: runs/NAME.log), is played at other N, and a copy without ballast
+# goes to results/runs/NAME: then it is done. After a stop the next call goes on where it was.
 set -eu
 cd "$(dirname "$0")/.."
 
-# a_run TASK ENCODER N SEED [WORD, ARGUMENTS OF train.py]: prints "NAME ARGUMENTS OF train.py".
-a_run() {
-    echo "$1-$2-n$3${5:+-$5}-seed$4 --task $1 --encoder $2 --distractors $3 --seed $4 ${*:6}"
-}
+paper_world="action_mode=absolute motor=torque timestep=0.004 substeps=10 cube_mass=0.02
+    finger_friction=0.1 goal_yaw=0.7854 reward_distance=250 reward_reach=0 reward_curiosity=10"
 
-# The runs of all figures, those of the first seed first.
-all_runs() {
-    paper_reward="reward_distance=250 reward_reach=0 reward_curiosity=10"
-    paper_cube="cube_mass=0.02 finger_friction=0.1"
-    paper_world="action_mode=absolute $paper_cube goal_yaw=0.7854"
-    paper_control="substeps=3 timestep=0.004 episode_steps=2500 steps=2500 envs=2"
-    paper_ppo="lr=2.5e-4 clip=0.5 anneal_clip=True epochs=4 minibatches=40 adam_eps=1e-8 log_std=0"
-    for seed in 0 1 2 3 4; do
-        for encoder in lrn rn attn; do
-            a_run push $encoder 2 $seed                        # figure 3, top
+# group SEEDS TEST_N ARGUMENTS NAME...: a line "NAME-seedS TEST_N ARGUMENTS of train.py" a run.
+# A NAME is TASK-ENCODER-nN[-VARIANT].
+group() {
+    for name in "${@:4}"; do
+        IFS=- read -r task encoder n _ <<< "$name"
+        for seed in $1; do
+            echo "$name-seed$seed $2 --task $task --encoder $encoder --distractors ${n#n}" \
+                 "--seed $seed" $3
         done
-        if [ $seed -le 2 ]; then
-            for encoder in lrn rn attn; do
-                a_run lift $encoder 2 $seed                    # figure 3, bottom
-            done
-            for task in push lift; do
-                a_run $task lrn-max 2 $seed
-            done
-            for N in 0 1 3; do                                 # figure 4, and LRN of figure 1
-                for encoder in lrn rn attn; do
-                    a_run push $encoder $N $seed
-                done
-            done
-            a_run push lrn 2 $seed norelations --set relations=False    # figure 5, left
-            a_run push lrn 2 $seed mean --set layer_norm=False
-            for width in 10 50 100; do
-                a_run push lrn 2 $seed z$width --set z_dim=$width
-            done
-            a_run push lrn 2 $seed nooverlap --set reward_overlap=0     # figure 5, right
-            a_run push lrn 2 $seed nodistance --set reward_distance=0
-            a_run push lrn 2 $seed noreach --set reward_reach=0
-            a_run push lrn 2 $seed curiosity --set reward_curiosity=10
-            a_run push lrn 2 $seed sparse --set reward_distance=0 reward_reach=0 \
-                reward_curiosity=10
-            a_run push lrn 2 $seed paperreward --set $paper_reward
-        fi
-        if [ $seed -le 1 ]; then
-            for N in 0 1 2; do                                 # MLP of figure 1
-                a_run push mlp $N $seed
-            done
-            for N in 1 2; do
-                a_run push mlp $N $seed long --frames 9000000
-            done
-            a_run push lrn-max 9 $seed                         # beyond the paper: 9 in training
-            a_run push lrn 2 $seed noreadout --set auxiliary=0 # without our read-out loss
-            for encoder in lrn rn attn; do                     # the paper's world
-                a_run push $encoder 2 $seed paperworld-long --frames 6000000 --set $paper_world \
-                    $paper_reward
-            done
-        fi
-        if [ $seed = 0 ]; then
-            for encoder in rn attn; do
-                a_run push $encoder 2 $seed noreadout --set auxiliary=0
-            done
-            for encoder in lrn rn attn; do
-                a_run push $encoder 2 $seed noreadout-long --frames 20000000 --set auxiliary=0
-            done
-            a_run push lrn 0 $seed noreadout --set auxiliary=0
-            a_run push lrn 2 $seed noreadout-paperreward --set auxiliary=0 \
-                $paper_reward
-            a_run push lrn 2 $seed noreadout-paperworld --set auxiliary=0 $paper_world \
-                $paper_reward
-            a_run push lrn 2 $seed noreadout-paperworld-long --frames 10000000 --set auxiliary=0 \
-                $paper_world $paper_reward
-            a_run push lrn 2 $seed noreadout-slippery --set auxiliary=0 $paper_cube \
-                $paper_reward
-            a_run push lrn 2 $seed noreadout-absolute --set auxiliary=0 action_mode=absolute \
-                $paper_reward
-            a_run push lrn 2 $seed noreadout-curiosity --set auxiliary=0 reward_curiosity=10
-            a_run push lrn 2 $seed rawvalues --set normalize_values=False
-            a_run push lrn 2 $seed rawadvantages --set normalize_advantages=False
-            a_run push lrn 2 $seed absolute --set action_mode=absolute
-            a_run push lrn 2 $seed paperworld --set $paper_world $paper_reward
-            a_run push lrn 2 $seed paperworld-ppo --set $paper_world $paper_reward $paper_ppo
-            a_run push lrn 2 $seed paperworld-std --set $paper_world $paper_reward log_std=0
-            a_run push lrn 2 $seed paperworld-30s --set $paper_world $paper_reward \
-                $paper_control
-            a_run push lrn 2 $seed paperworld-rawvalues --set $paper_world $paper_reward \
-                normalize_values=False
-            a_run push lrn 2 $seed paperworld-rawadvantages --set $paper_world $paper_reward \
-                normalize_advantages=False
-            a_run push lrn 2 $seed papercube --set $paper_cube goal_yaw=0.7854
-            a_run push lrn 2 $seed paperppo --set $paper_ppo
-            a_run push lrn 2 $seed papercontrol --set $paper_control
-            a_run push lrn 2 $seed paper --paper                # the printed recipe, 60 M frames
-            a_run push lrn 2 $seed paper-script --paper --set clip=0.2 reward_distance=2500 \
-                reward_reach=2500 reward_curiosity=0           # as CausalWorld's own script
-            a_run push lrn 2 $seed paper-values --paper --set normalize_values=True
-            a_run push lrn 2 $seed paper-normalized --paper --set normalize_values=True \
-                normalize_advantages=True
-            a_run push lrn 2 $seed paper-readout --paper --set normalize_values=True \
-                normalize_advantages=True auxiliary=30
-            a_run push lrn 2 $seed paper-batch --paper --set normalize_values=True \
-                normalize_advantages=True auxiliary=30 entropy=0.001 envs=8
-            a_run push lrn 2 $seed paper-short --paper --set normalize_values=True \
-                normalize_advantages=True auxiliary=30 entropy=0.001 envs=8 episode_steps=500
-            a_run push lrn 2 $seed paper-25hz --paper --set normalize_values=True \
-                normalize_advantages=True auxiliary=30 entropy=0.001 envs=8 episode_steps=125 \
-                substeps=5 timestep=0.008
-            a_run push lrn 9 $seed
-            a_run lift lrn 0 $seed
-        fi
     done
 }
 
+all_runs() {
+    group "0 1 2 3 4" 0-9,14,19 ""                     push-lrn-n2                 # figure 3
+    group "0 1 2"     0-9,14,19 ""                     push-{rn,attn}-n2 lift-lrn-n2
+    group "0"         0-9,14,19 ""                     lift-{rn,attn}-n2
+    group "0 1 2"     0-9,14,19 "--set crowd=0"        push-lrn-n2-nocrowd
+    group "0 1"       0-9,14,19 "--set crowd=0"        push-{rn,attn}-n2-nocrowd lift-lrn-n2-nocrowd
+    group "0"         0-9,14,19 "--set crowd=0"        lift-{rn,attn}-n2-nocrowd
+    group "0 1"       0-9       ""                     push-lrn-n{0,1,3}           # figures 1, 4
+    group "0"         0-9       ""                     push-{rn,attn}-n{0,1,3}
+    group "0"         0-9       "--set frames=9000000" push-mlp-n{0,1,2}
+    group "0 1"       0-9       "--set with_goal=False"      push-lrn-n2-norelations  # figure 5
+    group "0 1"       0-9       "--set layer_norm=False"     push-lrn-n2-mean
+    for z in 10 50 100; do
+        group "0 1"   0-9       "--set z_dim=$z"             push-lrn-n2-z$z
+    done
+    for term in overlap distance reach; do
+        group "0 1"   0-9       "--set reward_$term=0"       push-lrn-n2-no$term
+    done
+    group "0" 0-9 "--set frames=6000000 $paper_world"        push-{lrn,rn,attn}-n2-paperworld
+    group "0" 0-9 "--paper --set frames=20000000"            push-lrn-n2-paper
+}
+
 state_of() {
-    if [ -e "results/$1/zeroshot.csv" ]; then
+    if [ -e "results/runs/$1/checkpoint.pt" ]; then
         echo "done"
     elif [ -e "runs/$1/checkpoint.pt" ]; then
         tail -n 1 "runs/$1/progress.csv" | awk -F, '{ printf "begun, %.1f M frames\n", $2 / 1e6 }'
-    elif [ -e "results/unfinished/$1/progress.csv" ]; then
-        echo "to do (unfinished/)"
     else
-        echo "to do"
+        echo "missing"
     fi
 }
 
 one_run() {
-    name=$1
-    shift
-    log=runs/$name.log
-    mkdir -p runs
-    resume=
-    if [ -e "runs/$name/checkpoint.pt" ]; then
-        [ -e "$log" ] || fail "runs/$name was not begun by this script: move it away"
-        resume=--resume
-    fi
-    echo "$name: $*" | tee -a "$log"
-    if ! python train.py "$@" --ranks 1 --out "runs/$name" $resume >> "$log" 2>&1; then
-        echo "$name: not finished, see $log"
+    name=$1 test_n=$2
+    begin="--out runs/$name ${*:3}"
+    [ ! -e "runs/$name/checkpoint.pt" ] || begin="--resume runs/$name"
+    echo "$name: $begin"
+    if python train.py $begin && python evaluate.py "runs/$name" --distractors "$test_n" --save \
+            && python results/ship.py "runs/$name"; then
+        echo "$name: done" >&3
+    else
+        echo "$name: not finished, see runs/$name.log" >&3
         exit 255                                               # xargs starts no other run then
     fi
-    numbers=0-9
-    if [[ $name =~ -n[29](-paperworld-long)?-seed ]]; then
-        numbers=0-9,14,19                                      # figure 3, and beyond
-    fi
-    if [[ $name =~ -mlp-n([0-9]+) ]]; then
-        numbers=${BASH_REMATCH[1]}                             # it can play no other N
-    fi
-    python evaluate.py "runs/$name" --distractors "$numbers" --save >> "$log" 2>&1
-    if [[ $name =~ -lrn-n2-seed ]]; then
-        rm -rf "runs/$name-recentred"
-        python results/recentre.py "runs/$name" "runs/$name-recentred"
-        python evaluate.py "runs/$name-recentred" --distractors 0,2,5,9,14,19 --save >> "$log" 2>&1
-        cp "runs/$name-recentred/zeroshot.csv" "results/recentred/$name.csv"
-    fi
-    python results/ship.py "runs/$name"
-    echo "$name: done"
 }
 
-fail() {
-    echo "reproduce.sh: error: $1" >&2
-    exit 2
-}
-
-# A function, so that bash has read all of it before it runs: editing this file does no harm then.
-# Each further run is started from the file as it stands at that moment.
-main() {
-    jobs=1
-    list=
-    pattern=
-    while [ $# -gt 0 ]; do
-        case $1 in
-            --one) shift; one_run "$@"; exit ;;                # what xargs calls, in the last line
-            --jobs) jobs=${2-}; shift; shift || true ;;
-            --list) list=yes; shift ;;
-            -*) fail "no option $1, only --list and --jobs" ;;
-            *) [ -z "$pattern" ] || fail "one pattern, got $pattern $1: \"a|b\" names both"
-               pattern=$1; shift ;;
-        esac
-    done
-    [[ $jobs =~ ^[1-9][0-9]*$ ]] || fail "--jobs needs a number of runs"
-    rows=$(all_runs | awk -v pattern="${pattern:-.}" '$1 ~ pattern')
-    [ "$rows" ] || fail "no run's name matches $pattern"
+jobs=1 list= pattern=.
+while [ $# -gt 0 ]; do
+    case $1 in
+        --one) shift; mkdir -p runs; one_run "$@" 3>&1 >> "runs/$1.log" 2>&1; exit ;;
+        --jobs) jobs=$2; shift 2 ;;
+        --list) list=yes; shift ;;
+        *) pattern=$1; shift ;;
+    esac
+done
+all_runs | awk -v pattern="$pattern" '$1 ~ pattern' | while read -r name arguments; do
+    state=$(state_of "$name")
     if [ "$list" ]; then
-        while read -r name arguments; do
-            printf "%-44s %-24s %s\n" "$name" "$(state_of "$name")" "$arguments"
-        done <<< "$rows"
-        exit
+        printf "%-32s %-20s %s\n" "$name" "$state" "${arguments#* }"
+    elif [ "$state" != "done" ]; then
+        echo "$name $arguments"
     fi
-    left=$(while read -r name arguments; do
-        [ "$(state_of "$name")" = "done" ] || echo "$name $arguments"
-    done <<< "$rows")
-    if [ "$left" ]; then
-        xargs -P "$jobs" -L 1 results/reproduce.sh --one <<< "$left"
-    else
-        echo "done before; to train one anew, remove results/NAME and runs/NAME first"
-    fi
-}
-
-main "$@"; exit
+done | if [ "$list" ]; then cat; else xargs -r -P "$jobs" -L 1 results/reproduce.sh --one; fi

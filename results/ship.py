@@ -1,14 +1,12 @@
-"""Copy run folders into results/, small enough to ship.
+"""Copy trained and evaluated runs to results/runs/, small enough to ship.
 
-    python results/ship.py runs/push-lrn-n2-seed0 runs/lift-lrn-n2-seed0
-    python results/ship.py --curves results/search runs/noise-2 [...]     only NAME.csv
+    python results/ship.py runs/push-lrn-n2-seed0 [RUN ...]
 
-A checkpoint keeps the weights and loses the optimiser: it can be evaluated, not trained on. A CSV
-with more than 300 rows is thinned: each row then stands for a window of updates, with the window's
-last update, frames, seconds and lr, the sum of its episodes and the mean of everything else.
-zeroshot.csv files are copied as they are. A run that is shipped with its scores is refused.
+The checkpoint loses its optimiser: it can be evaluated, not trained on. progress.csv keeps at most
+150 rows: each stands for a window of updates, with the window's last update, frames and lr, the sum
+of its episodes and the mean of everything else. zeroshot*.csv are copied as they are. A run that is
+shipped already is refused.
 """
-import argparse
 import csv
 import glob
 import math
@@ -16,80 +14,56 @@ import os
 import shutil
 import sys
 
+import torch
+
 HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path.insert(0, os.path.dirname(HERE))
-from train import fail, load, save
+from train import fail, load
 
-ROWS = 300
-LAST = ("update", "frames", "seconds", "lr")
+ROWS = 150
+LAST = ("update", "frames", "lr")
 SUMS = ("episodes", "cut_short")
 
 
-def thinned(rows):
-    """At most ROWS rows (dicts of text) that stand for windows of the given ones."""
-    window = math.ceil(len(rows) / ROWS)
-    if window <= 1:
-        return rows
-    return [together(rows[i:i + window]) for i in range(0, len(rows), window)]
-
-
 def together(rows):
-    """One row for several."""
-    row = {}
-    for name in rows[0]:
-        values = [float(each[name]) for each in rows]
-        if name in LAST:
-            row[name] = rows[-1][name]
-        elif name in SUMS:
-            row[name] = round(sum(values))
-        else:
-            row[name] = f"{sum(values) / len(values):.6g}"
-    return row
+    """One row (dict of text) for several."""
+    joined = dict(rows[-1])
+    for name in joined.keys() - set(LAST):
+        total = sum(float(row[name]) for row in rows)
+        joined[name] = round(total) if name in SUMS else f"{total / len(rows):.6g}"
+    return joined
 
 
 def thin_file(source, target):
-    """Write a thinned copy of a CSV."""
+    """Write a progress.csv of at most ROWS rows."""
     with open(source, newline="") as file:
-        reader = csv.DictReader(file)
-        rows = list(reader)
+        rows = list(csv.DictReader(file))
+    window = math.ceil(len(rows) / ROWS)
     with open(target, "w", newline="") as file:
-        writer = csv.DictWriter(file, reader.fieldnames, lineterminator="\n")
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
         writer.writeheader()
-        writer.writerows(thinned(rows))
+        writer.writerows(together(rows[i:i + window]) for i in range(0, len(rows), window))
 
 
-def ship(run, folder):
-    """Copy a run: checkpoint without optimiser, thinned curves, scores."""
-    checkpoint, _ = load(run)
-    if os.path.exists(os.path.join(folder, "zeroshot.csv")):
-        raise ValueError(f"{folder} holds a run already: remove it first")
+def ship(run):
+    folder = os.path.join(HERE, "runs", os.path.basename(os.path.normpath(run)))
+    scores = glob.glob(os.path.join(run, "zeroshot*.csv"))
+    if not scores:
+        fail(f"{run} has no scores: python evaluate.py {run} --save first")
+    if os.path.exists(os.path.join(folder, "checkpoint.pt")):
+        fail(f"{folder} holds a run already: remove it first")
     os.makedirs(folder, exist_ok=True)
+    checkpoint, _ = load(run)
     checkpoint.pop("optimizer", None)
-    save(checkpoint, os.path.join(folder, "checkpoint.pt"))
-    for name in ("progress.csv", "timing.csv"):
-        thin_file(os.path.join(run, name), os.path.join(folder, name))
-    for path in glob.glob(os.path.join(run, "zeroshot*.csv")):
+    thin_file(os.path.join(run, "progress.csv"), os.path.join(folder, "progress.csv"))
+    for path in scores:
         shutil.copy(path, folder)
-
-
-def main():
-    parser = argparse.ArgumentParser(description="Copy runs into results/, without ballast.")
-    parser.error = fail
-    parser.add_argument("runs", nargs="+", metavar="RUN")
-    parser.add_argument("--curves", metavar="DIR", help="copy progress.csv alone, as DIR/NAME.csv")
-    args = parser.parse_args()
-    for run in args.runs:
-        name = os.path.basename(os.path.normpath(run))
-        try:
-            if args.curves:
-                os.makedirs(args.curves, exist_ok=True)
-                thin_file(os.path.join(run, "progress.csv"),
-                          os.path.join(args.curves, f"{name}.csv"))
-            else:
-                ship(run, os.path.join(HERE, name))
-        except (OSError, ValueError, IndexError) as error:
-            fail(str(error))
+    torch.save(checkpoint, os.path.join(folder, "checkpoint.pt"))          # last: now it is shipped
 
 
 if __name__ == "__main__":
-    main()
+    for run in sys.argv[1:]:
+        try:
+            ship(run)
+        except (OSError, ValueError) as error:
+            fail(str(error))
