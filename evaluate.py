@@ -31,7 +31,7 @@ import numpy as np
 import pybullet
 import torch
 
-from train import STOPPED, derived_seed, fail, load, make_env
+from train import SCORES, STOPPED, derived_seed, fail, load, make_env
 from trifinger_env import DIVERGED, SOLVED, TIME
 
 COLUMNS = ("distractors", "episodes", "success", "ci95", "success_strict", "ci95_strict", "solved",
@@ -173,7 +173,7 @@ def evaluate(run, args):
     if checkpoint["encoder"] == "mlp":
         numbers = [checkpoint["distractors"]]                  # its input is fixed
     make_env(checkpoint["task"], numbers[-1], checkpoint["settings"]).close()
-    table = os.path.join(run, "zeroshot-sampled.csv" if args.sample_actions else "zeroshot.csv")
+    table = os.path.join(run, SCORES[args.sample_actions])
     if args.save:
         open(table + ".tmp", "w").close()                      # if it fails, then before the play
     print(f"{run}: {checkpoint['encoder']} trained on {checkpoint['task']} with "

@@ -53,7 +53,8 @@ class LRN(nn.Module):
         """All r_i = g_theta(o_i, o_goal): objects (B, K, D), goal (B, D) -> (B, K, D)."""
         if not self.with_goal:
             return self.g(objects)                             # (B, K, D), r_i = g_theta(o_i)
-        goal = goal[:, None].expand_as(objects)                # (B, K, D), one and the same K times
+        B, K, D = objects.shape
+        goal = goal.view(B, 1, D).expand(B, K, D)              # one and the same K times
         return self.g(torch.cat([objects, goal], dim=2))       # (B, K, 2D) -> (B, K, D)
 
     def forward(self, objects, goal):

@@ -14,7 +14,6 @@ A run folder holds progress.csv, one row per update, and checkpoint.pt, saved af
 import argparse
 import csv
 import fcntl
-import glob
 import io
 import math
 import os
@@ -303,6 +302,9 @@ def replace(path, content):
     os.replace(path + ".tmp", path)
 
 
+SCORES = ("zeroshot.csv", "zeroshot-sampled.csv")              # by evaluate.py
+
+
 class Run:
     """The folder of a run and how far it has come; rank 0 alone writes to it."""
 
@@ -319,6 +321,11 @@ class Run:
     def path(self, name):
         return os.path.join(self.args.out, name)
 
+    def remove(self, *names):
+        for name in names:
+            if os.path.exists(self.path(name)):
+                os.remove(self.path(name))
+
     def open(self):
         """Make the folder ready: progress.csv with the rows up to the checkpoint."""
         if self.args.checkpoint:
@@ -326,8 +333,7 @@ class Run:
                 lines = file.readlines()[:1 + self.update]
         else:                            # of an overwritten run nothing is left
             lines = [",".join(PROGRESS) + "\n"]
-            for old in glob.glob(self.path("zeroshot*.csv")) + glob.glob(self.path("*.pt")):
-                os.remove(old)
+            self.remove("checkpoint.pt", *SCORES)
         replace(self.path("progress.csv"), "".join(lines).encode())
 
     def write(self, row, elapsed):
@@ -339,8 +345,7 @@ class Run:
                 [row[key] if isinstance(row[key], int) else f"{row[key]:.6g}" for key in PROGRESS])
             file.flush()
             os.fsync(file.fileno())
-        for scores in glob.glob(self.path("zeroshot*.csv")):   # they are of the weights before
-            os.remove(scores)
+        self.remove(*SCORES)                                   # they are of the weights before
         self.save(frames)
         left = (self.last_update - self.update) * self.seconds / self.update / 60
         print(f"{frames:8d} frames  success {row['success']:.2f}  return {row['return']:7.0f}  "

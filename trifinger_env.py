@@ -72,7 +72,7 @@ OFFSET = 0.05945                         # how far a tip stands beside its finge
 GAIN = 12.5                              # 1/s
 TORQUE = 0.36                            # N m
 # CausalWorld's is a torque u = KP (target - angle) - KD speed, from which safety damping takes
-# DAMPING x speed; both are cut to TORQUE. At full torque the joints reach 2.0, 0.95 and 8.8 rad/s.
+# DAMPING x speed; both are cut to TORQUE. So a joint reaches TORQUE / DAMPING at most, in rad/s.
 KP, KD, DAMPING = 10.0, (0.1, 0.3, 0.001), (0.08, 0.08, 0.04)
 
 # Table 1: columns of an observation's rows, for readers and for whoever picks some out. The
@@ -248,9 +248,10 @@ class TriFingerEnv(Env):
         if distractors not in range(len(IDENTIFIER_POOL)):
             raise ValueError(f"the arena holds 21 cubes: distractors must be an integer from 0 to "
                              f"20, got {distractors!r}")
-        if not min(episode_steps, substeps, timestep, cube_mass, finger_friction) > 0:
+        sizes = (episode_steps, substeps, timestep, cube_mass, finger_friction)
+        if not all(0 < size < math.inf for size in sizes) or not 0 <= goal_yaw < math.inf:
             raise ValueError("episode_steps, substeps, timestep, cube_mass and finger_friction "
-                             "must be positive")
+                             "must be positive, goal_yaw at least 0")
         self.task, self.distractors = task, int(distractors)
         self.episode_steps, self.substeps, self.timestep = episode_steps, substeps, timestep
         self.action_mode, self.action_scale, self.motor = action_mode, action_scale, motor

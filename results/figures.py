@@ -125,6 +125,8 @@ def draw_seeds(axes, curves, label, color, marker=None):
 
 def draw_training(axes, runs, label, color, column="success"):
     draw_seeds(axes, [training_curve(run, column) for run in runs], label, color)
+    axes.set(xlabel="million frames")
+    axes.margins(x=0)                    # ends where the data do
 
 
 def draw_zero_shot(axes, runs, label, color, marker="o", mark="0.4"):
@@ -135,18 +137,8 @@ def draw_zero_shot(axes, runs, label, color, marker="o", mark="0.4"):
     trained = re.search(r"-n(\d+)", os.path.basename(group_of(runs[0])))
     if trained:
         axes.axvline(int(trained[1]), color=mark, linestyle=":", linewidth=1.5)
-
-
-def finish_training(axes, title):
-    axes.set(title=title, xlabel="million frames", ylabel="success in training", ylim=(0, 1))
-    axes.margins(x=0)                    # ends where the data do
-
-
-def finish_zero_shot(axes, title):
-    axes.set(title=title, xlabel="N, distractors at test time", ylabel="zero-shot success",
-             ylim=(0, 1), xticks=(0, 2, 5, 9, 14, 19))
-    last = axes.dataLim.x1 if axes.lines else 9
-    axes.set_xlim(-0.3, last + 0.3)
+    axes.set(xlabel="N, distractors at test time", ylim=(0, 1), xticks=(0, 2, 5, 9, 14, 19))
+    axes.set_xlim(-0.3, axes.dataLim.x1 + 0.3)                 # ends where the data do
 
 
 def one_legend(figure, ncols):
@@ -207,8 +199,8 @@ def figure_3():
             if runs:
                 draw_training(left, runs, *ENCODERS[encoder])
                 draw_zero_shot(right, runs, *ENCODERS[encoder])
-        finish_training(left, title)
-        finish_zero_shot(right, title)
+        left.set(title=title, ylabel="success in training", ylim=(0, 1))
+        right.set(title=title, ylabel="zero-shot success")
     one_legend(figure, 3)
     return figure
 
@@ -224,8 +216,8 @@ def figure_4():
             if runs:
                 shade = to_rgba(color, share)
                 draw_zero_shot(axes, runs, None, shade, marker, mark=shade)
-        finish_zero_shot(axes, label)
-        axes.label_outer()
+        axes.set(title=label)
+    panels[0].set(ylabel="zero-shot success")
     handles = [plt.Line2D([], [], color=to_rgba("black", share), marker=marker,
                           label=f"trained at N = {N}") for N, (share, marker) in styles.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=4)
@@ -240,9 +232,9 @@ def figure_5():
             runs = runs_of(group)
             if runs:
                 draw_zero_shot(axes, runs, label, color)
-        finish_zero_shot(axes, title)
-        axes.label_outer()
+        axes.set(title=title)
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
+    panels[0].set(ylabel="zero-shot success")
     return figure
 
 
@@ -302,8 +294,7 @@ def figure_readout():
             runs = runs_of(name.format(encoder))
             if runs:
                 draw_training(axes, runs, *ENCODERS[encoder], column="auxiliary_loss")
-        axes.set(title=title, xlabel="million frames", yscale="log")
-        axes.margins(x=0)
+        axes.set(title=title, yscale="log")
     panels[0].set(ylabel="read-out loss")
     one_legend(figure, 3)
     return figure
@@ -322,8 +313,8 @@ def figure_of(runs):
             draw_zero_shot(right, played, group, color)
         else:
             print(f"{group} has no zero-shot curve: python evaluate.py RUN --save makes one")
-    finish_training(left, "training")
-    finish_zero_shot(right, "zero-shot")
+    left.set(ylabel="success in training", ylim=(0, 1))
+    right.set(ylabel="zero-shot success")
     one_legend(figure, 2)
     return figure
 
@@ -351,8 +342,7 @@ def draw(name):
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description="Draw figures, or the curves of runs (see the first lines of figures.py).")
+    parser = argparse.ArgumentParser(description="Draw figures (see the top of figures.py).")
     parser.add_argument("what", nargs="*", help=f"{', '.join(FIGURES)}, or run folders")
     what = parser.parse_args().what
     plt.rcParams.update({"font.size": 11, "axes.grid": True, "grid.alpha": 0.3,

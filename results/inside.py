@@ -7,9 +7,9 @@
 The table: success; the same where the way from target to goal was clear and where a distractor
 blocked it; share of blocked ones; distance from the target cube to where the read-out sees it;
 drift of z from z at the N of training; for LRN the length of the distractors' mean relation against
-the target's; for lifting success by the goal's height. All but success are of the start.
-A crowd is made of scenes at the N of training, as Agent.crowd makes it, so its read error judges
-the transfer without a look at a test N.
+the target's; for lifting success by the goal's height. All but success are of the start. A crowd
+is made of scenes at the N of training, as Agent.crowd makes it: it judges the transfer without a
+look at a test N.
 --figures plays results/runs/push-{lrn,rn,attn}-n2-seed0 and writes figure6.csv (z at each N in the
 plane), figure6-drift.csv (distance of the z at N from those at 2), figure7.csv (LRN's relations in
 the plane) and figure8.csv (their lengths) in results/. Needs scikit-learn.
@@ -32,7 +32,6 @@ from trifinger_env import CUBE, IDENTIFIER, POSITION, POSITION_SCALE
 BANDS = ((0, 5), (5, 10), (10, 15), (15, 20))                  # of a lifting goal's height, cm
 KINDS = ("finger 0", "finger 1", "finger 2", "target")         # of relations, then distractors
 POINTS = 5000                            # most points that t-SNE and distances are given
-MOMENTS = 5                              # of an episode that t-SNE gets to see
 
 
 # ---- playing
@@ -91,7 +90,6 @@ def read_error(agent, obs):
 
 def drift_of(z, z_trained):
     """Mean distance of z (B, Z) from z_trained, in units of that between two rows of z_trained."""
-    # Identifiers and a lifting goal's height differ at another N, and move z, too.
     B = len(z)
     spread = torch.cdist(z_trained, z_trained).sum() / (B * (B - 1))
     return (z - z_trained).norm(dim=1).mean() / spread
@@ -179,14 +177,14 @@ def some(points, count):
 
 
 def moments(steps):
-    """Moments evenly over an episode: (steps, E, ...) -> (MOMENTS * E, ...)."""
-    at = np.linspace(0, len(steps) - 1, MOMENTS).astype(int)
+    """Five moments evenly over an episode: (steps, E, ...) -> (5 E, ...)."""
+    at = np.linspace(0, len(steps) - 1, 5).astype(int)
     return steps[at].reshape(-1, *steps.shape[2:])
 
 
 def write(name, columns, rows):
     """A CSV in results/; floats with three decimals."""
-    texts = [[f"{cell:.3f}" if isinstance(cell, float) else cell for cell in row] for row in rows]
+    texts = [[f"{cell:.4f}" if isinstance(cell, float) else cell for cell in row] for row in rows]
     with open(os.path.join(HERE, name), "w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([columns, *texts])
     print(f"wrote {name}", flush=True)

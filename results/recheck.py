@@ -6,7 +6,6 @@
 A line a run and N: the score in zeroshot.csv (episodes 0 to 199), that of as many other episodes,
 and whether they differ by more than the 95 % interval of their difference: one in twenty should.
 """
-import argparse
 import csv
 import glob
 import math
@@ -23,7 +22,7 @@ from train import fail, load
 
 FIRST = 1000                             # number of the first of the other episodes
 NUMBERS = (2, 9)                         # of distractors
-RUNS = 5                                 # so many are drawn
+EPISODES, RUNS = 200, 5                  # played at each N; drawn
 
 
 def scores_of(run):
@@ -32,13 +31,12 @@ def scores_of(run):
         return {int(row["distractors"]): row for row in csv.DictReader(file)}
 
 
-def compare(run, N, row, episodes):
+def compare(run, N, row):
     """Print a line."""
     checkpoint, agent = load(run)
     ends = []
-    for first in range(FIRST, FIRST + episodes, evaluate.CHUNK):
-        part = range(first, min(first + evaluate.CHUNK, FIRST + episodes))
-        ends += evaluate.play(checkpoint, agent, N, part)
+    for first in range(FIRST, FIRST + EPISODES, evaluate.CHUNK):
+        ends += evaluate.play(checkpoint, agent, N, range(first, first + evaluate.CHUNK))
     again = evaluate.summary(N, ends)
     score, half = float(row["success"]), float(row["ci95"])
     is_within = abs(again["success"] - score) <= math.hypot(again["ci95"], half)
@@ -48,22 +46,17 @@ def compare(run, N, row, episodes):
 
 
 def main():
-    parser = argparse.ArgumentParser(description="Play shipped runs in other episodes.")
-    parser.error = fail
-    parser.add_argument("runs", nargs="*", metavar="RUN", help="default: five shipped ones")
-    parser.add_argument("--episodes", type=evaluate.positive, default=200, metavar="E")
-    args = parser.parse_args()
     torch.set_num_threads(1)
-    shipped = [os.path.dirname(path)
-               for path in sorted(glob.glob(os.path.join(HERE, "runs", "*", "checkpoint.pt")))]
-    try:
-        for run in args.runs or random.sample(shipped, min(RUNS, len(shipped))):
-            for N, row in scores_of(run).items():
-                if N in NUMBERS:
-                    compare(run, N, row, args.episodes)
-    except (OSError, KeyError, ValueError) as error:
-        fail(str(error))
+    shipped = glob.glob(os.path.join(HERE, "runs", "*", "checkpoint.pt"))
+    drawn = random.sample(sorted(shipped), min(RUNS, len(shipped)))
+    for run in sys.argv[1:] or map(os.path.dirname, drawn):
+        for N, row in scores_of(run).items():
+            if N in NUMBERS:
+                compare(run, N, row)
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (OSError, KeyError, ValueError) as error:
+        fail(str(error))

@@ -11,10 +11,9 @@ set -eu
 cd "$(dirname "$0")/.."
 
 paper_world="action_mode=absolute motor=torque timestep=0.004 substeps=10 cube_mass=0.02
-    finger_friction=0.1 goal_yaw=0.7854 reward_distance=250 reward_reach=0 reward_curiosity=10"
+    finger_friction=0.5 goal_yaw=0.7854 reward_distance=250 reward_reach=0 reward_curiosity=10"
 
-# group SEEDS TEST_N ARGUMENTS NAME...: a line "NAME-seedS TEST_N ARGUMENTS of train.py" a run.
-# A NAME is TASK-ENCODER-nN[-VARIANT].
+# group SEEDS TEST_N ARGUMENTS TASK-ENCODER-nN[-VARIANT]...: a line "NAME TEST_N ARGUMENTS" a run.
 group() {
     for name in "${@:4}"; do
         IFS=- read -r task encoder n _ <<< "$name"
@@ -65,16 +64,17 @@ one_run() {
     if python train.py $begin && python evaluate.py "runs/$name" --distractors "$test_n" --save \
             && python results/ship.py "runs/$name"; then
         echo "$name: done" >&3
-    else
-        echo "$name: not finished, see runs/$name.log" >&3
-        exit 255                                               # xargs starts no other run then
+        exit
     fi
+    echo "$name: not finished, see runs/$name.log" >&3
+    exit 255                                                   # xargs starts no other run then
 }
 
+mkdir -p runs
 jobs=1 list= pattern=.
 while [ $# -gt 0 ]; do
     case $1 in
-        --one) shift; mkdir -p runs; one_run "$@" 3>&1 >> "runs/$1.log" 2>&1; exit ;;
+        --one) shift; one_run "$@" 3>&1 >> "runs/$1.log" 2>&1; exit ;;
         --jobs) jobs=$2; shift 2 ;;
         --list) list=yes; shift ;;
         *) pattern=$1; shift ;;

@@ -1,13 +1,14 @@
 """How fast is this, and beside what? Contestants take turns in one process, on one core.
 
-    python results/speed.py                     all three sections, ten minutes
+    python results/speed.py                     all three sections, some minutes
     python results/speed.py env                 the environment by N
     python results/speed.py train               our PPO and Stable-Baselines3's (which it needs)
     python results/speed.py encoders            LRN, RN and ATTN by the number of objects
     python results/speed.py train --rounds 1    fewer rounds
 
-Times are CPU times, which other work on the machine disturbs less than it does a clock on the wall.
+Times are CPU times, which other work on the machine disturbs less than the wall clock's.
 Every number is a median over rounds, and so is every ratio: of two times in the same round.
+step/physics is a step in units of the stepSimulation inside it, reset/step a seeded reset in steps.
 """
 import argparse
 import os
@@ -42,32 +43,10 @@ CONTROLS = ((5, 0.008), (3, 0.004))      # ours and the paper's: substeps, times
 STEPS = 100                              # of a timed episode
 
 
-class TimedPhysics:
-    """Stands in for PyBullet's stepSimulation while it is measured, and adds up its time."""
-
-    def __enter__(self):
-        self.bare, self.spent = pybullet.stepSimulation, 0.0
-        pybullet.stepSimulation = self
-        return self
-
-    def __call__(self, client):
-        begin = process_time()
-        self.bare(client)
-        self.spent += process_time() - begin
-
-    def __exit__(self, *_):
-        pybullet.stepSimulation = self.bare
-
-
-def play(env, actions):
-    for action in actions:
-        env.step(action)
-
-
 def measure_env(rounds):
     """Frames/s of random actions; a step in units of its bare physics, a reset in steps."""
-    print("The environment: one step in units of the stepSimulation inside it, a reset with a seed "
-          "in steps\n   N  control   frames/s  step/physics  reset/step")
+    bare, physics = pybullet.stepSimulation, []
+    pybullet.stepSimulation = lambda client: physics.append(seconds(bare, client))
     rng = np.random.default_rng(0)
     envs = {(control, N): TriFingerEnv("push", N, substeps=control[0], timestep=control[1])
             for control in CONTROLS for N in (0, 2, 5, 9)}
@@ -75,9 +54,11 @@ def measure_env(rounds):
     for seed in range(rounds):
         for key, env in envs.items():
             reset = seconds(lambda: env.reset(seed=seed))
-            with TimedPhysics() as physics:
-                spent = seconds(play, env, rng.uniform(-1, 1, (STEPS, 9)))
-            found[key].append((STEPS / spent, spent / physics.spent, reset / spent * STEPS))
+            physics.clear()
+            step = sum(seconds(env.step, action) for action in rng.uniform(-1, 1, (STEPS, 9)))
+            found[key].append((STEPS / step, step / sum(physics), reset / step * STEPS))
+    pybullet.stepSimulation = bare
+    print("The environment\n   N  control   frames/s  step/physics  reset/step")
     for ((substeps, timestep), N), rows in found.items():
         rate, step, reset = np.median(rows, axis=0)
         print(f"{N:4d}  {substeps} x {1000 * timestep:.0f} ms {rate:9.0f} {step:13.2f} "
@@ -93,68 +74,56 @@ LOSSES = {                               # our contestants -> what differs from 
 }
 
 
-class OurUpdate:
-    """One update of LRN at N = 2: play a batch, learn from it."""
+def our_update(envs, changes):
+    """A function that does one update of LRN at N = 2: plays a batch, learns from it."""
+    settings = {**DEFAULTS, **changes}
+    learner = PPO(Agent("lrn", 2, settings), envs, **{name: settings[name] for name in LEARNER})
 
-    def __init__(self, envs, changes):
-        settings = {**DEFAULTS, **changes}
-        self.learner = PPO(Agent("lrn", 2, settings), envs,
-                           **{name: settings[name] for name in LEARNER})
-        self.updates = 0
+    def update():
+        learner.rollout(reseed(learner, seed=0, update=0, rank=0))
+        learner.update(remaining=1.0)
 
-    def __call__(self):
-        seeds = reseed(self.learner, 0, self.updates, 0)
-        self.learner.rollout(seeds)
-        self.learner.update(remaining=1.0)
-        self.updates += 1
+    return update
 
 
-class SB3Update:
+def sb3_update(count):
     """The same by Stable-Baselines3's PPO, with the same net and batch."""
+    from stable_baselines3 import PPO as SB3
+    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+    from stable_baselines3.common.vec_env import DummyVecEnv
 
-    def __init__(self, count):
-        from stable_baselines3 import PPO as SB3
-        from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-        from stable_baselines3.common.vec_env import DummyVecEnv
+    class Encoder(BaseFeaturesExtractor):
+        """Our token MLPs and LRN: observation -> z. SB3 makes heads of its own."""
 
-        class Encoder(BaseFeaturesExtractor):
-            """Our token MLPs and LRN: observation -> z."""
+        def __init__(self, space):
+            super().__init__(space, DEFAULTS["z_dim"])
+            self.agent = Agent("lrn", 2, DEFAULTS)
+            del self.agent.policy, self.agent.value, self.agent.read_out, self.agent.log_std
 
-            def __init__(self, space):
-                super().__init__(space, DEFAULTS["z_dim"])
-                self.agent = Agent("lrn", 2, DEFAULTS)
-                # SB3 makes heads of its own.
-                del self.agent.policy, self.agent.value, self.agent.read_out, self.agent.log_std
+        def forward(self, obs):
+            return self.agent.encode(obs)
 
-            def forward(self, obs):
-                return self.agent.encode(obs)
-
-        self.batch = count * DEFAULTS["steps"]
-        heads = [DEFAULTS["hidden"]] * 2
-        self.model = SB3(
-            "MultiInputPolicy", DummyVecEnv([lambda: make_env("push", 2, DEFAULTS)] * count),
-            device="cpu", n_steps=DEFAULTS["steps"], n_epochs=DEFAULTS["epochs"],
-            batch_size=self.batch // DEFAULTS["minibatches"], learning_rate=DEFAULTS["lr"],
-            policy_kwargs=dict(
-                features_extractor_class=Encoder, net_arch=dict(pi=heads, vf=heads),
-                activation_fn=torch.nn.ReLU, log_std_init=DEFAULTS["log_std"]))
-
-    def __call__(self):
-        self.model.learn(self.batch, reset_num_timesteps=False)
+    batch, heads = count * DEFAULTS["steps"], [DEFAULTS["hidden"]] * 2
+    model = SB3(
+        "MultiInputPolicy", DummyVecEnv([lambda: make_env("push", 2, DEFAULTS)] * count),
+        device="cpu", n_steps=DEFAULTS["steps"], n_epochs=DEFAULTS["epochs"],
+        batch_size=batch // DEFAULTS["minibatches"], learning_rate=DEFAULTS["lr"],
+        policy_kwargs=dict(
+            features_extractor_class=Encoder, net_arch=dict(pi=heads, vf=heads),
+            activation_fn=torch.nn.ReLU, log_std_init=DEFAULTS["log_std"]))
+    return lambda: model.learn(batch, reset_num_timesteps=False)
 
 
 def measure_train(rounds, count=DEFAULTS["envs"]):
     """Training frames/s, beside those of SB3."""
     try:
-        contestants = {"SB3": SB3Update(count)}
+        contestants = {"SB3": sb3_update(count)}
     except ImportError:
         fail("the comparison needs Stable-Baselines3: pip install stable-baselines3")
     envs = [make_env("push", 2, DEFAULTS) for _ in range(count)]           # ours take turns in them
     for name, changes in LOSSES.items():
-        contestants[name] = OurUpdate(envs, changes)
-    found = []
-    for _ in range(rounds + 1):
-        found.append([seconds(update) for update in contestants.values()])
+        contestants[name] = our_update(envs, changes)
+    found = [[seconds(update) for update in contestants.values()] for _ in range(rounds + 1)]
     times = np.array(found[1:])          # the first round warms up
     print("Training LRN at N = 2\n                      frames/s  times SB3's")
     rates = np.median(count * DEFAULTS["steps"] / times, axis=0)
@@ -170,10 +139,6 @@ SAMPLES, WIDTH = 64, 64
 ENCODERS = {"LRN": (LRN, NUMBERS), "ATTN": (ATTN, NUMBERS), "RN": (RN, NUMBERS[:3])}
 
 
-def forward_and_backward(encoder, objects, goal):
-    encoder(objects, goal).sum().backward()
-
-
 def measure_encoders(rounds):
     """Milliseconds of a forward and backward pass by K."""
     found = {}
@@ -183,8 +148,9 @@ def measure_encoders(rounds):
             goal = torch.randn(SAMPLES, WIDTH)
             for name, (encoder, numbers) in ENCODERS.items():
                 if K in numbers:
-                    spent = 1000 * seconds(forward_and_backward, encoder(), objects, goal)
-                    found.setdefault((name, K), []).append(spent)
+                    net = encoder()
+                    spent = seconds(lambda: net(objects, goal).sum().backward())
+                    found.setdefault((name, K), []).append(1000 * spent)
     print(f"Encoders: ms of a forward and backward pass on {SAMPLES} samples (times LRN's)")
     for name, (_, numbers) in ENCODERS.items():
         # The first round warms up.
