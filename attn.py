@@ -1,10 +1,11 @@
 """Self-attention encoder: the paper's baseline (appendix A.4, figure 2 box A).
 
-    o_attn = softmax(q(o) k(o)^T / sqrt(D/H)) v(o)             in each of H heads
-    z = LayerNorm(f_phi(sum_{i=1..K+1} o_attn_i))
+    o_attn = softmax(q(o) k(o)^T / sqrt(D/H)) v(o)             equation 3, in each of H heads
+    z = LayerNorm(f_phi(sum_{i=1..K+1} o_attn_i))              equation 4
 
 The goal joins the K objects as token K+1, and every token attends to every token: (K+1)^2 weights
-per head. As in the paper's equations there is no output projection and no residual.
+per head. As in the paper's equations there is no output projection and no residual; its o has
+tokens as columns, ours as rows.
 
 Shapes: objects (B, K, D), goal (B, D) -> z (B, Z).
         B batch, K objects, D token width (the paper's d), Z width of z (its d_z), H heads.
@@ -18,7 +19,7 @@ from torch import nn
 
 
 def orthogonal(layer, gain=math.sqrt(2)):
-    """Set orthogonal weights and a zero bias (why: see lrn.py); returns the layer."""
+    """Orthogonal weights, zero bias (ours: with PyTorch's default all z start out nearly alike)."""
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
     return layer
@@ -61,7 +62,7 @@ class ATTN(nn.Module):
         return per_head.transpose(1, 2).flatten(2), weights    # (B, K+1, D), heads joined
 
     def forward(self, objects, goal):
-        """Second equation of A.4: objects (B, K, D), goal (B, D) -> z (B, Z)."""
+        """Equation 4: objects (B, K, D), goal (B, D) -> z (B, Z)."""
         attended, _ = self.attend(objects, goal)               # (B, K+1, D)
         return self.norm(self.f(attended.sum(dim=1)))          # (B, Z), sum_i o_attn_i
 

@@ -23,6 +23,7 @@ import io
 import multiprocessing
 import os
 import signal
+import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -31,7 +32,7 @@ import numpy as np
 import pybullet
 import torch
 
-from train import SCORES, STOPPED, derived_seed, fail, load, make_env
+from train import STOPPED, derived_seed, fail, load, make_env
 from trifinger_env import DIVERGED, SOLVED, TIME
 
 COLUMNS = ("distractors", "episodes", "success", "ci95", "success_strict", "ci95_strict", "solved",
@@ -78,7 +79,7 @@ def play(checkpoint, agent, distractors, episodes, sample_actions=False):
     generators = noise_of(episodes) if sample_actions else None
     ends = [None] * len(envs)
     while None in ends:
-        # Ended ones go on in the batch: its size decides bits.
+        # Ended ones stay in the batch: a smaller one may round differently.
         for e, action in enumerate(actions(agent, observations, generators)):
             if ends[e] is None:
                 observations[e], _, _, truncated, info = envs[e].step(action)
@@ -91,25 +92,10 @@ def play(checkpoint, agent, distractors, episodes, sample_actions=False):
 
 # ---- the sweep over N
 
-WORKER = {}                              # a worker's checkpoint and agent
-
-
-def start_worker(content):
-    """Load the weights once: the run may be trained on meanwhile."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)               # Ctrl-C is for the main process
+def play_chunk(content, *arguments):
+    """play() in a process of its own. `content`: a checkpoint's bytes; its file may change."""
     torch.set_num_threads(1)
-    WORKER["checkpoint"], WORKER["agent"] = load(io.BytesIO(content))
-
-
-def play_chunk(distractors, episodes, sample_actions):
-    return play(WORKER["checkpoint"], WORKER["agent"], distractors, episodes, sample_actions)
-
-
-def cores():
-    """Number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):                       # fewer than there are on a cluster
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count()
+    return play(*load(io.BytesIO(content)), *arguments)
 
 
 def sweep(content, numbers, episodes, sample_actions=False):
@@ -119,13 +105,15 @@ def sweep(content, numbers, episodes, sample_actions=False):
     is killed.
     """
     parts = [range(episodes)[first:first + CHUNK] for first in range(0, episodes, CHUNK)]
-    pool = ProcessPoolExecutor(min(cores(), len(numbers) * len(parts)),
-                               multiprocessing.get_context("spawn"), start_worker, (content,))
+    pool = ProcessPoolExecutor(min(os.cpu_count(), len(numbers) * len(parts)),
+                               multiprocessing.get_context("spawn"))
     print("   N  success           strict            solved", flush=True)
     rows, begin = [], time.monotonic()
+    ctrl_c = signal.signal(signal.SIGINT, signal.SIG_IGN)      # for this process, not the workers
+    played = {n: [pool.submit(play_chunk, content, n, part, sample_actions) for part in parts]
+              for n in numbers}
+    signal.signal(signal.SIGINT, ctrl_c)
     try:
-        played = {n: [pool.submit(play_chunk, n, part, sample_actions) for part in parts]
-                  for n in numbers}
         for n, chunks in played.items():
             row = summary(n, [end for chunk in chunks for end in chunk.result()])
             rows.append(row)
@@ -169,13 +157,11 @@ def evaluate(run, args):
     """The table of one run, saved if asked for."""
     file = os.path.join(run, "checkpoint.pt") if os.path.isdir(run) else run
     checkpoint, _ = load(file)
-    numbers = args.distractors or list(range(10))
-    if checkpoint["encoder"] == "mlp":
-        numbers = [checkpoint["distractors"]]                  # its input is fixed
-    make_env(checkpoint["task"], numbers[-1], checkpoint["settings"]).close()
-    table = os.path.join(run, SCORES[args.sample_actions])
-    if args.save:
-        open(table + ".tmp", "w").close()                      # if it fails, then before the play
+    own = [checkpoint["distractors"]]
+    numbers = args.distractors or (own if checkpoint["encoder"] == "mlp" else list(range(10)))
+    make_env(checkpoint["task"], numbers[-1], checkpoint["settings"]).close()  # refuses too many
+    if args.save and not (os.path.isdir(run) and os.access(run, os.W_OK)):
+        raise ValueError(f"--save: {run} is no folder that can be written to")
     print(f"{run}: {checkpoint['encoder']} trained on {checkpoint['task']} with "
           f"{checkpoint['distractors']} distractors, {checkpoint['frames']} frames")
     with open(file, "rb") as opened:
@@ -184,13 +170,13 @@ def evaluate(run, args):
     if args.save:
         if load(file)[0]["update"] != checkpoint["update"]:
             raise ValueError(f"{run} was trained on meanwhile: its scores are not saved")
-        with open(table + ".tmp", "w", newline="") as opened:
+        name = "zeroshot-sampled.csv" if args.sample_actions else "zeroshot.csv"
+        with open(os.path.join(run, name), "w", newline="") as opened:
             writer = csv.DictWriter(opened, COLUMNS, lineterminator="\n")
             writer.writeheader()
             writer.writerows({key: f"{value:.4f}" if isinstance(value, float) else value
                               for key, value in row.items()} for row in rows)
-        os.replace(table + ".tmp", table)
-        print(f"wrote {table}")
+        print(f"wrote {os.path.join(run, name)}")
 
 
 # ---- watching
@@ -211,6 +197,8 @@ def play_live(agent, env, episode, sample_actions):
 def watch(run, distractors, episodes, sample_actions):
     """Play episodes in PyBullet's window, in real time, until it is closed or Ctrl-C."""
     checkpoint, agent = load(run)
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        raise ValueError("--watch needs a screen, and DISPLAY is not set")
     signal.signal(signal.SIGINT, signal.SIG_DFL)               # or a window that never comes hangs
     env = make_env(checkpoint["task"], distractors, checkpoint["settings"], "human")
     print(f"{run}, {distractors} distractors: target blue, goal green; Ctrl-C stops", flush=True)
@@ -251,18 +239,10 @@ def numbers(text):
     found = set()
     for part in text.split(","):
         low, dash, high = part.partition("-")
-        found.update(range(int(low), min(int(high if dash else low), 99) + 1))
+        found.update(range(int(low), int(high if dash else low) + 1))
     if not found:
         raise ValueError
     return sorted(found)
-
-
-def positive(text):
-    """An integer >= 1, as argparse's `type`."""
-    number = int(text)
-    if number < 1:
-        raise ValueError
-    return number
 
 
 def read_command():
@@ -274,10 +254,11 @@ def read_command():
     add("--distractors", type=numbers, metavar="LIST",
         help="numbers of distractors, as 0-9 or 0,2,14 (default 0-9); to watch or film: "
              "the smallest of them (default: as trained)")
-    add("--episodes", type=positive, default=200, metavar="E",
+    add("--episodes", type=int, default=200, metavar="E",
         help="episodes at each N (default 200)")
     add("--sample-actions", action="store_true",
         help="sample actions as in training instead of playing the policy's means")
+    add = parser.add_mutually_exclusive_group().add_argument
     add("--save", action="store_true",
         help="write the rows to RUN/zeroshot.csv (zeroshot-sampled.csv for sampled actions)")
     add("--watch", action="store_true", help="play the first run live in a window")
@@ -303,7 +284,8 @@ def main():
     except BrokenProcessPool:
         fail("one of the playing processes was killed", status=1)
     except KeyboardInterrupt:
-        fail("stopped; with --save, runs that were played to the end have their CSV", STOPPED)
+        print("stopped", file=sys.stderr)
+        sys.exit(STOPPED)
 
 
 if __name__ == "__main__":

@@ -1,22 +1,22 @@
-"""Proximal Policy Optimisation (Schulman et al., 2017; the paper's appendix A.2), one rank or many.
+"""Proximal Policy Optimisation (Schulman et al., 2017; appendix A.2) in one process or several.
 
     L = -E[min(ratio A_t, clip(ratio, 1 - eps, 1 + eps) A_t)]      A_t advantages, eps `clip`
         + c_v E[(V - R)^2] / 2                                     c_v `value_coef`
         - c_e H                                                    c_e `entropy`, H the entropy
         + c_a auxiliary loss                                       c_a `auxiliary`
 
-For dict observations and continuous actions. All it asks of a network is
-`agent(obs) -> (mean (n, A), log_std (A,), value (n,))` for any number n of observations, where
-log_std is a parameter, the same for all (and `agent.auxiliary(obs)`, a loss, if c_a > 0); of an
-environment, Gymnasium's reset and step. Actions are samples of a Gaussian, which the environment
-has to clip. Every rollout starts with fresh episodes, so T must be at least an episode's length.
+For dict observations and continuous actions. It asks
+- of a network, agent(obs) -> mean (n, A), log_std (A,), a parameter, and value (n,), for any n
+  observations; if c_a > 0 also agent.auxiliary(obs), a loss
+- of an environment, Gymnasium's reset and step; it has to clip actions, samples of a Gaussian.
+Every rollout starts with fresh episodes: with T below an episode's length no end is ever seen.
 A rank is one of the processes that train together: each steps its own environments, and they
 average gradients and the moments of advantages and returns over torch.distributed (as DD-PPO
 does), so many ranks give the gradient of one on the joined minibatch.
 
 Shapes: T steps of a rollout, E environments of this rank, B = T * E samples, A actions.
         What a rollout stores is (T, E, ...).
-Run:    python ppo.py        learns to reach a random point on a line, in a few seconds
+Run:    python ppo.py        learns to reach a random point on a line, in ten seconds
 """
 import math
 
@@ -62,23 +62,17 @@ def rank_mean(tensor):
 
 class PPO(nn.Module):
     """The learner: agent, optimiser and value normaliser. Defaults suit small problems such as the
-    example below; train.py sets every one of them (SETTINGS).
+    example below.
 
     A module, so that its state dict holds the agent and the running moments of the returns.
 
-    envs                   E environments of this rank
-    steps                  T steps of a rollout; a batch is T * E samples
     minibatches, epochs    the batch is cut into equal parts and passed over `epochs` times;
                            ValueError unless `minibatches` divides T * E
-    lam                    GAE's lambda
-    entropy, value_coef    coefficients of the loss
     lr_power               the learning rate falls as lr x (share of training left) ^ lr_power:
                            1 linearly, 0 not at all
     anneal_clip            multiply the clip range by the share of training left
     normalize_advantages   to mean 0 and standard deviation 1 over the whole batch of all ranks
     normalize_values       the value network learns (return - running mean) / running std
-    auxiliary              weight of `agent.auxiliary(obs)`, an extra loss on each minibatch;
-                           0: never called
 
     Random numbers come from torch's global generator: seed it before rollout() and an update
     repeats exactly.
@@ -121,35 +115,28 @@ class PPO(nn.Module):
         diagnostics. Returns the finished episodes: dicts with "return", "length" and "info", that
         of the last step.
         """
-        first = [env.reset(seed=seed)[0] for env, seed in zip(self.envs, seeds)]
-        played, final_observations, episodes = self.play(first)
-        values = played["values"]
+        played, final_observations, episodes = self.play(seeds)
+        values = played.pop("values")
         next_values = self.bootstrap_values(values, final_observations)
         if self.normalize_values:        # from the network's units to those of the rewards
             values = values * self.return_std() + self.return_mean
             next_values = next_values * self.return_std() + self.return_mean
-        advantages = gae(played["rewards"], values, next_values, played["terminated"],
-                         played["is_last"], self.discount, self.lam)
-        returns = advantages + values                          # R, targets of the value network
+        advantages = gae(played.pop("rewards"), values, next_values, played.pop("terminated"),
+                         played.pop("is_last"), self.discount, self.lam)
+        returns = advantages + values                          # R, lambda-returns: V learns them
         # 1 - Var[R - V] / Var[R]
-        unexplained = (returns - values).var() / returns.var().clamp(min=1e-8)
-        self.explained_variance = 1 - unexplained
-        self.batch = {                                         # by the names of loss()'s arguments
-            "actions": played["actions"],
-            "old_log_prob": played["log_prob"],
-            "advantages": advantages,
-            "returns": returns,
-        }
+        self.explained_variance = 1 - advantages.var() / returns.var().clamp(min=1e-8)
+        self.batch = {**played, "advantages": advantages, "returns": returns}
         return episodes
 
-    def play(self, current):
-        """Play T steps from the observations `current`, one per environment.
+    def play(self, seeds):
+        """Play T steps in every environment.
 
         Returns what happened (dict of (T, E, ...) tensors), the final observations
         {(t, e): observation} wherever an episode or the rollout ended, and the finished episodes.
-        Changes `current`.
         """
         T, E = self.steps, len(self.envs)
+        current = [env.reset(seed=seed)[0] for env, seed in zip(self.envs, seeds)]
         self.observations = {key: torch.empty(T, E, *value.shape)
                              for key, value in current[0].items()}
         rewards, terminations, is_last = (np.zeros((T, E), np.float32) for _ in range(3))
@@ -174,6 +161,7 @@ class PPO(nn.Module):
                 ended = terminated or truncated
                 if ended or t == T - 1:
                     is_last[t, e] = True
+                    # Copied: an environment may use its arrays again.
                     final_observations[t, e] = {key: np.array(value, np.float32)
                                                 for key, value in current[e].items()}
                 if ended:
@@ -185,7 +173,7 @@ class PPO(nn.Module):
         played = {"rewards": torch.from_numpy(rewards), "values": torch.stack(values),
                   "terminated": torch.from_numpy(terminations), "actions": actions,
                   "is_last": torch.from_numpy(is_last),
-                  "log_prob": normal_log_prob(actions, torch.stack(means), log_std)}
+                  "old_log_prob": normal_log_prob(actions, torch.stack(means), log_std)}
         return played, final_observations, episodes
 
     def bootstrap_values(self, values, final_observations):
@@ -215,17 +203,16 @@ class PPO(nn.Module):
             group["lr"] = lr
         batch = self.normalized_batch()
         observations = {key: value.flatten(0, 1) for key, value in self.observations.items()}
-        totals = {}
+        stats = []
         for _ in range(self.epochs):
             for indices in torch.randperm(len(batch["returns"])).chunk(self.minibatches):
                 minibatch = {key: value[indices] for key, value in batch.items()}
                 obs = {key: value[indices] for key, value in observations.items()}
-                for key, value in self.minibatch_step(obs, minibatch, clip).items():
-                    share = value.detach() / (self.epochs * self.minibatches)
-                    totals[key] = totals.get(key, 0.0) + share
-        totals["explained_variance"] = self.explained_variance
-        averages = rank_mean(torch.stack([value.float() for value in totals.values()]))
-        return {**dict(zip(totals, averages.tolist())), "lr": lr}
+                stats.append(self.minibatch_step(obs, minibatch, clip))
+        means = {key: torch.stack([each[key] for each in stats]).mean() for key in stats[0]}
+        means["explained_variance"] = self.explained_variance
+        averages = rank_mean(torch.stack(list(means.values())))
+        return {**dict(zip(means, averages.tolist())), "lr": lr}
 
     def normalized_batch(self):
         """The last rollout as (B, ...) tensors, returns and advantages normalised if asked for.
@@ -284,14 +271,13 @@ class PPO(nn.Module):
         loss = (policy_loss + self.value_coef * value_loss - self.entropy_coef * entropy
                 + self.auxiliary_coef * auxiliary_loss)
 
-        with torch.no_grad():
-            # E[(ratio - 1) - log ratio]: unbiased and never negative ("k3", Schulman, 2020)
-            approx_kl = ((ratio - 1) - log_ratio).mean()
-            clip_fraction = ((ratio - 1).abs() > clip).float().mean()
+        # KL(pi_old || pi) = E[(ratio - 1) - log ratio]: never negative ("k3", Schulman, 2020)
+        approx_kl = ((ratio - 1) - log_ratio).mean()
+        clip_fraction = ((ratio - 1).abs() > clip).float().mean()
         stats = {"policy_loss": policy_loss, "value_loss": value_loss,
                  "auxiliary_loss": auxiliary_loss, "entropy": entropy,
                  "approx_kl": approx_kl, "clip_fraction": clip_fraction}
-        return loss, stats
+        return loss, {name: value.detach() for name, value in stats.items()}
 
 
 # ---- an example
@@ -340,7 +326,5 @@ if __name__ == "__main__":
         stats = learner.update(1 - update / 30)
         if update % 5 == 4:
             mean_return = np.mean([episode["return"] for episode in episodes])
-            mean_gap = np.mean([episode["info"]["gap"] for episode in episodes])
-            print(f"update {update + 1:2d}: mean return {mean_return:6.2f}, mean final gap "
-                  f"{mean_gap:.2f}, KL {stats['approx_kl']:.4f}, "
-                  f"explained variance {stats['explained_variance']:.2f}")
+            print(f"update {update + 1:2d}: mean return {mean_return:6.2f}, KL "
+                  f"{stats['approx_kl']:.4f}, variance explained {stats['explained_variance']:.2f}")

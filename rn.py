@@ -1,9 +1,9 @@
 """Relation Network over all pairs: the paper's quadratic comparison (appendix A.5, figure 2 box B).
 
-    z = LayerNorm(f_phi(sum_{i=1..K+1} sum_{j=1..K+1} g_theta(o_i, o_j)))
+    z = LayerNorm(f_phi(sum_{i=1..K+1} sum_{j=1..K+1} g_theta(o_i, o_j)))      equation 5
 
 The goal joins the K objects as token K+1. Pairs are ordered and include a token with itself, so
-there are (K+1)^2 relations.
+there are (K+1)^2 relations (A.5, 4.2; section 3.2 says K^2).
 
 Shapes: objects (B, K, D), goal (B, D) -> z (B, Z).
         B batch, K objects, D token width (the paper's d), Z width of z (its d_z).
@@ -17,7 +17,7 @@ from torch.nn.functional import linear
 
 
 def orthogonal(layer, gain=math.sqrt(2)):
-    """Set orthogonal weights and a zero bias (why: see lrn.py); returns the layer."""
+    """Orthogonal weights, zero bias (ours: with PyTorch's default all z start out nearly alike)."""
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
     return layer
@@ -29,7 +29,7 @@ class RN(nn.Module):
     def __init__(self, token_dim=64, z_dim=25):
         super().__init__()
         D, Z = token_dim, z_dim
-        # g_theta has four layers: self.first, which stands apart (see relations()), and self.g.
+        # g_theta has four layers; the first stands apart, so that relations() can split it.
         self.first = orthogonal(nn.Linear(2 * D, D))
         self.g = nn.Sequential(
             nn.ReLU(), orthogonal(nn.Linear(D, D)),
@@ -50,7 +50,7 @@ class RN(nn.Module):
         return self.g(from_i + from_j)                         # (B, K+1, K+1, D)
 
     def forward(self, objects, goal):
-        """Equation of A.5: objects (B, K, D), goal (B, D) -> z (B, Z)."""
+        """Equation 5: objects (B, K, D), goal (B, D) -> z (B, Z)."""
         r = self.relations(objects, goal)                      # (B, K+1, K+1, D)
         return self.norm(self.f(r.sum(dim=(1, 2))))            # (B, Z), sum_i sum_j r_ij
 

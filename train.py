@@ -17,7 +17,6 @@ import fcntl
 import io
 import math
 import os
-import signal
 import sys
 import time
 from importlib.metadata import version
@@ -60,8 +59,8 @@ ENV = {
     "finger_friction": Setting(1.0, 0.5, "IsaacGymEnvs; CW asks for 0.1, PyBullet keeps 0.5"),
     "goal_yaw": Setting(0.0, math.pi / 4, "largest yaw, rad; 0: only the place counts (4.1: pose)"),
 }
-# A.1: alpha_1, alpha_2 (2 mm are worth 0.5; ours: 10), alpha_3 (a penalty, smaller for a fast cube;
-# ours: none). Ours alone is reach: fingertips to the cube, as in CW's script.
+# A.1: alpha_1; alpha_2, at which 2 mm earn 0.5 (at ours 10); alpha_3, which makes slow cubes costly
+# (ours: none). Only ours is reach: fingertips to the cube, as in CW's script.
 PAPER_REWARD = {"overlap": 100.0, "distance": 250.0, "curiosity": 10.0}
 REWARD = {f"reward_{term}": Setting(weight, PAPER_REWARD.get(term, 0.0), "weight of the term")
           for term, weight in REWARD_WEIGHTS.items()}
@@ -221,9 +220,9 @@ class Agent(nn.Module):
     def crowd(self, cubes, target):
         """The target among M of the scene's other cubes, drawn with replacement, M from 0 to crowd.
 
-        cubes (B, N+1, 18), target (B,) -> crowd (B, M+1, 18), the target's column in it (B,).
-        Training at one N leaves open what a distractor adds to z: f_phi's bias can make up for N
-        times anything. Here M changes, so it has to be nothing.
+        cubes (B, N+1, 18), target (B,) -> crowd (B, M+1, 18), the target's index in it (B,).
+        At a fixed N the bias of f_phi can cancel whatever N distractors add to the sum. At a random
+        M it cannot, so a distractor has to add nothing.
         """
         B, count = cubes.shape[:2]
         M = int(torch.randint(self.largest_crowd + 1, (), generator=self.crowds))
@@ -248,7 +247,7 @@ def derived_seed(*numbers):
     """One seed from several numbers, such as (run's seed, update, stream).
 
     Sums like seed + update would make seed 1 repeat seed 0 one update later; SeedSequence mixes
-    the numbers. (It reads missing ones as 0: compare tuples of one length only.)
+    the numbers. (It pads with zeros: always pass equally many.)
     """
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
@@ -273,21 +272,22 @@ def reseed(learner, seed, update, rank):
 def load(source):
     """Checkpoint dict, and its agent, of a run folder, a checkpoint's path or an open file.
 
-    A setting that the checkpoint lacks takes its default. ValueError in one line if it is not a
-    checkpoint of ours.
+    A setting that the checkpoint lacks takes its default, a reward term 0. ValueError in one line
+    if it is not a checkpoint of ours.
     """
     if isinstance(source, str) and os.path.isdir(source):
         source = os.path.join(source, "checkpoint.pt")
     try:
         checkpoint = torch.load(source, weights_only=True, map_location="cpu")
-        checkpoint["settings"] = {**DEFAULTS, **checkpoint["settings"]}
+        no_reward = dict.fromkeys(REWARD, 0.0)
+        checkpoint["settings"] = {**DEFAULTS, **no_reward, **checkpoint["settings"]}
         agent = Agent(checkpoint["encoder"], checkpoint["distractors"], checkpoint["settings"])
         prefix = "agent."
         agent.load_state_dict({name.removeprefix(prefix): value
                                for name, value in checkpoint["learner"].items()
                                if name.startswith(prefix)})
     except Exception as error:           # torch.load raises many kinds; the user needs one line
-        reason = " ".join(str(error).split())[:200]
+        reason = str(error).split(". ")[0].split("\n")[0]
         raise ValueError(f"{source} is not a readable checkpoint of train.py "
                          f"({type(error).__name__}: {reason})") from None
     return checkpoint, agent.eval()      # for an encoder of your own, with dropout, say
@@ -300,9 +300,6 @@ def replace(path, content):
         file.flush()
         os.fsync(file.fileno())
     os.replace(path + ".tmp", path)
-
-
-SCORES = ("zeroshot.csv", "zeroshot-sampled.csv")              # by evaluate.py
 
 
 class Run:
@@ -321,19 +318,12 @@ class Run:
     def path(self, name):
         return os.path.join(self.args.out, name)
 
-    def remove(self, *names):
-        for name in names:
-            if os.path.exists(self.path(name)):
-                os.remove(self.path(name))
-
     def open(self):
         """Make the folder ready: progress.csv with the rows up to the checkpoint."""
+        lines = [",".join(PROGRESS) + "\n"]
         if self.args.checkpoint:
             with open(self.path("progress.csv")) as file:
                 lines = file.readlines()[:1 + self.update]
-        else:                            # of an overwritten run nothing is left
-            lines = [",".join(PROGRESS) + "\n"]
-            self.remove("checkpoint.pt", *SCORES)
         replace(self.path("progress.csv"), "".join(lines).encode())
 
     def write(self, row, elapsed):
@@ -345,7 +335,9 @@ class Run:
                 [row[key] if isinstance(row[key], int) else f"{row[key]:.6g}" for key in PROGRESS])
             file.flush()
             os.fsync(file.fileno())
-        self.remove(*SCORES)                                   # they are of the weights before
+        for scores in ("zeroshot.csv", "zeroshot-sampled.csv"):            # of the weights before
+            if os.path.exists(self.path(scores)):
+                os.remove(self.path(scores))
         self.save(frames)
         left = (self.last_update - self.update) * self.seconds / self.update / 60
         print(f"{frames:8d} frames  success {row['success']:.2f}  return {row['return']:7.0f}  "
@@ -374,29 +366,35 @@ class Run:
 
 def make_learner(args, settings):
     """PPO with its agent and this rank's environments; every rank starts from the same weights."""
-    if settings["envs"] % args.ranks:
-        raise ValueError(f"{args.ranks} processes cannot share envs={settings['envs']}")
+    envs, rest = divmod(settings["envs"], args.ranks)
+    if rest or envs * settings["steps"] % settings["minibatches"]:
+        raise ValueError(f"{args.ranks} processes cannot share envs={settings['envs']}, or their "
+                         f"batches do not divide into minibatches={settings['minibatches']}")
     if settings["steps"] < settings["episode_steps"]:
         raise ValueError(f"rollouts of steps={settings['steps']} never see the end of an episode "
                          f"of episode_steps={settings['episode_steps']}")
     torch.manual_seed(args.seed)
     agent = Agent(args.encoder, args.distractors, settings)
-    envs = [make_env(args.task, args.distractors, settings)
-            for _ in range(settings["envs"] // args.ranks)]
-    return PPO(agent, envs, **{name: settings[name] for name in LEARNER})
+    worlds = [make_env(args.task, args.distractors, settings) for _ in range(envs)]
+    return PPO(agent, worlds, **{name: settings[name] for name in LEARNER})
 
 
 def summarize(episodes):
     """Columns of progress.csv about the episodes of all ranks: means, but for two counts."""
-    rows = torch.tensor([[
-        1.0, episode["return"], episode["length"], episode["info"]["fractional_success"],
-        episode["info"]["fractional_success_strict"],
-        episode["info"]["fractional_success"] >= SOLVED, episode["info"]["truncated_by"] != TIME,
-    ] for episode in episodes])
-    sums = rows.sum(dim=0)
+    infos = [episode["info"] for episode in episodes]
+    columns = {
+        "episodes": [1.0 for _ in episodes],
+        "return": [episode["return"] for episode in episodes],
+        "length": [episode["length"] for episode in episodes],
+        "success": [info["fractional_success"] for info in infos],
+        "success_strict": [info["fractional_success_strict"] for info in infos],
+        "solved": [info["fractional_success"] >= SOLVED for info in infos],
+        "cut_short": [info["truncated_by"] != TIME for info in infos],
+    }
+    sums = torch.tensor([sum(values) for values in columns.values()])
     if dist.is_initialized():
         dist.all_reduce(sums)
-    means = dict(zip(PROGRESS[2:9], (sums / sums[0]).tolist()))
+    means = dict(zip(columns, (sums / sums[0]).tolist()))
     return {**means, "episodes": int(sums[0]), "cut_short": int(sums[-1])}
 
 
@@ -449,7 +447,6 @@ def read_command(argv=None):
         help="the paper's numbers; where it prints none, its sources' or a guess")
     add("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE",
         help="change some of SETTINGS")
-    add("--overwrite", action="store_true", help="start anew in a folder that holds a run")
     add("--resume", metavar="RUN", help="go on with the run in this folder; takes no other option")
     args = parser.parse_args(argv)
     args.ranks = int(os.environ["WORLD_SIZE"]) if dist.is_torchelastic_launched() else 1
@@ -488,9 +485,10 @@ def read_value(item, name, text):
     try:
         value = {"True": True, "False": False}[text] if kind is bool else kind(text)
     except (KeyError, ValueError):
-        fail(f"--set {item}: expected {name}=<{kind.__name__}>")
-    if kind is int and value < (name != "crowd"):              # that alone may be 0
-        fail(f"--set {item}: expected an integer >= 1")
+        fail(f"--set {item}: expected {'True or False' if kind is bool else kind.__name__}")
+    lowest = 0 if name == "crowd" else 1
+    if kind is int and value < lowest:
+        fail(f"--set {item}: expected an integer >= {lowest}")
     if kind is float and not math.isfinite(value):
         fail(f"--set {item}: expected a finite number")
     return value
@@ -508,11 +506,9 @@ def resume(args, given):
         fail(f"--resume: {error}")
     if "optimizer" not in checkpoint:
         fail(f"--resume {args.resume}: weights without the optimiser can be evaluated only")
-    ranks = checkpoint["ranks"]
-    if ranks != args.ranks:
-        start = "python" if ranks == 1 else f"torchrun --standalone --nproc-per-node {ranks}"
-        fail(f"--resume: a run of {ranks} processes goes on with: {start} train.py --resume "
-             f"{args.resume}")
+    if checkpoint["ranks"] != args.ranks:
+        fail(f"--resume: for {checkpoint['ranks']} processes start it as torchrun --standalone "
+             f"--nproc-per-node {checkpoint['ranks']} train.py --resume {args.resume}")
     for name in ("encoder", "task", "distractors", "seed"):
         setattr(args, name, checkpoint[name])
     args.out, args.checkpoint = args.resume, checkpoint
@@ -526,29 +522,15 @@ def claim_folder(args):
         fcntl.flock(os.open(args.out, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         fail(f"{args.out} is in use: another process trains in it")
-    has_run = os.path.exists(os.path.join(args.out, "checkpoint.pt"))
-    if has_run and not (args.checkpoint or args.overwrite):
-        fail(f"{args.out} already holds a run: --resume {args.out} goes on with it, --overwrite "
-             f"starts anew, --out takes another folder")
-
-
-def stop_on_ctrl_c(folder, rank):
-    """Ctrl-C ends the process at once: the folder is always as of the last whole update."""
-    def stop(*_):
-        if rank == 0:
-            saved = os.path.exists(os.path.join(folder, "checkpoint.pt"))
-            goes_on = f"python train.py --resume {folder} goes on" if saved else "nothing is saved"
-            os.write(2, f"\nstopped; {goes_on}\n".encode())
-        os._exit(STOPPED)
-
-    signal.signal(signal.SIGINT, stop)
+    if os.path.exists(os.path.join(args.out, "checkpoint.pt")) and not args.checkpoint:
+        fail(f"{args.out} already holds a run: --resume {args.out} goes on with it, --out takes "
+             f"another folder")
 
 
 def main():
     args, settings = read_command()
     rank = int(os.environ["RANK"]) if args.ranks > 1 else 0
     torch.set_num_threads(1)             # more do not pay on networks this small
-    stop_on_ctrl_c(args.out, rank)
     try:
         learner = make_learner(args, settings)
         if rank == 0:
@@ -560,14 +542,15 @@ def main():
     if args.ranks > 1:
         dist.init_process_group("gloo")
     run = Run(args, settings, learner)
-    if rank == 0:
-        run.open()
     try:
-        train(run, rank)
-    except FloatingPointError as error:                        # on every rank alike: one says so
         if rank == 0:
-            print(f"update {run.update + 1}: {error}; the last checkpoint stays", file=sys.stderr)
-        sys.exit(1)
+            run.open()
+        train(run, rank)
+    except (FloatingPointError, KeyboardInterrupt) as error:   # on every rank alike: one says so
+        if rank == 0:
+            print(f"{str(error) or 'stopped'} after {run.update} updates, saved in {args.out}",
+                  file=sys.stderr)
+        sys.exit(STOPPED if isinstance(error, KeyboardInterrupt) else 1)
     if rank == 0:
         print(f"finished after {run.update} updates, {run.seconds / 60:.1f} minutes: {args.out}")
     if args.ranks > 1:

@@ -11,8 +11,6 @@ Shapes: observation {"cubes": (N+1, 18), "fingers": (3, 10), "goal": (12,)} floa
 Run:    python trifinger_env.py        one episode of random actions, and frames/s
 """
 import math
-import os
-import sys
 import time
 from typing import NamedTuple
 
@@ -32,23 +30,19 @@ GAP = 0.001                              # left free between cubes, and to the w
 WALL_SIDES = 12                          # the round wall is made of so many boxes
 GRASP_RADIUS = 0.124                     # inside it a finger can get behind a cube, m
 OUTSIDE, BELOW, ABOVE = WALL + 0.03, -0.03, 1.0                # beyond them a cube has left, m
-CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multiplies those in touch
-# Sources differ in a cube's mass and the fingers' friction: CausalWorld (the paper's simulator) has
-# 0.02 kg in its pushing task, else 0.08, and 0.5 (it asks for 0.1, but PyBullet gives that to the
-# fingers' bases, which touch nothing); trifinger_simulation 0.08 kg and 0.5; IsaacGymEnvs, and we,
-# 0.08 kg and 1.0. A real cube weighs 0.094 kg.
-IDENTIFIER_POOL = np.linspace(-1.0, 1.0, 21)                   # none is new when N grows
+CUBE_FRICTION, FLOOR_FRICTION = 1.0, 0.5                       # Bullet multiplies the two in touch
+IDENTIFIER_POOL = np.linspace(-1.0, 1.0, 21)                   # fixed: none is new at a larger N
 HIGHEST_GOAL = 0.2                       # height of the centre of the highest goal in lifting, m
 ITERATIONS = 16                          # of Bullet's solver: with fewer, grips slip (tested)
 
 # The robot: three fingers of three joints each, upper, middle and lower
 JOINTS = (0, 1, 2)
 BASE = 0.0455                            # radius at which fingers are mounted, m
-HEIGHT = 0.329                           # of the fingers' mounts, m: 0.34 in CausalWorld, whose
-                                         # floor lies at 0.011
+HEIGHT = 0.329                           # of the fingers' mounts, m: CausalWorld's 0.34 less the
+                                         # height of its floor, 0.011
 LINK = 0.16                              # length of the middle and the lower link, m
 TIP = 0.0095                             # radius of a finger's lower link and tip, m
-TIP_HALF_EDGE = 0.014                    # of the square that a tip at rest keeps free of cubes, m
+TIP_HALF_EDGE = 0.014                    # half edge of the cube-free square under a resting tip, m
 JOINT_LOW = (-1.57, -1.2, -3.0)          # limits of upper, middle and lower joint, rad
 JOINT_HIGH = (1.0, 1.57, 3.0)
 REST = (0.0, 0.55, -0.7)                 # at reset, rad: tips hang beside the cubes, 0.034 m high
@@ -71,12 +65,11 @@ OFFSET = 0.05945                         # how far a tip stands beside its finge
 # The motors. Bullet's own aims at a speed of GAIN x (target - angle), with at most TORQUE.
 GAIN = 12.5                              # 1/s
 TORQUE = 0.36                            # N m
-# CausalWorld's is a torque u = KP (target - angle) - KD speed, from which safety damping takes
-# DAMPING x speed; both are cut to TORQUE. So a joint reaches TORQUE / DAMPING at most, in rad/s.
+# CausalWorld's is a torque KP (target - angle) - KD speed, cut to TORQUE, less DAMPING x speed, cut
+# again. So a joint reaches TORQUE / DAMPING at most, in rad/s.
 KP, KD, DAMPING = 10.0, (0.1, 0.3, 0.001), (0.08, 0.08, 0.04)
 
-# Table 1: columns of an observation's rows, for readers and for whoever picks some out. The
-# identifier comes last in cubes and goal. In action_mode "integrated" a fingertip is shown where
+# Columns of an observation's rows (Table 1). In action_mode "integrated" a fingertip is shown where
 # the joint targets would hold it: the agent has to see those targets somewhere, and where the
 # fingertip really is follows from the joints' angles anyway.
 SIZE, POSITION, QUATERNION = slice(1, 4), slice(4, 7), slice(7, 11)        # of a cube and the goal
@@ -244,7 +237,12 @@ class TriFingerEnv(Env):
                  cube_mass=0.08, finger_friction=1.0, goal_yaw=0.0, reward_weights=None,
                  render_mode=None):
         self._client = None
-        check_names(task, action_mode, motor, reward_weights, render_mode)
+        for name, got, known in (("task", task, ("push", "lift")),
+                                 ("action_mode", action_mode, ("integrated", "absolute")),
+                                 ("motor", motor, ("position", "torque")),
+                                 ("render_mode", render_mode, (None, "rgb_array", "human"))):
+            if got not in known:
+                raise ValueError(f"{name} must be one of {known}, got {got!r}")
         if distractors not in range(len(IDENTIFIER_POOL)):
             raise ValueError(f"the arena holds 21 cubes: distractors must be an integer from 0 to "
                              f"20, got {distractors!r}")
@@ -277,7 +275,6 @@ class TriFingerEnv(Env):
         self._world = {"physicsClientId": self._client}        # last argument of PyBullet's calls
         if render_mode == "human":
             pb.configureDebugVisualizer(pb.COV_ENABLE_GUI, 0, **self._world)
-            pb.configureDebugVisualizer(pb.COV_ENABLE_SHADOWS, 0, **self._world)
             pb.resetDebugVisualizerCamera(0.6, 0, -40, [0, 0, 0.1], **self._world)
 
     def __reduce__(self):
@@ -330,8 +327,10 @@ class TriFingerEnv(Env):
             self._body(0, wall, rim, middle, yaw_quaternion(angle))
 
     def _build_finger(self, mount, quaternion):
-        """One finger: a body of three joints. (Bullet solves three of them faster than one of nine
-        joints.) Only the lower link can touch things."""
+        """One finger, of whose links only the lower one can touch things.
+
+        Bullet solves three bodies of three joints faster than one of nine.
+        """
         touching = pb.createCollisionShape(
             pb.GEOM_CAPSULE, radius=TIP, height=LINK,
             collisionFramePosition=[0, -0.008, -LINK / 2], **self._world)
@@ -345,32 +344,33 @@ class TriFingerEnv(Env):
             linkJointTypes=[pb.JOINT_REVOLUTE] * 3, linkJointAxis=JOINT_AXIS, **self._world)
         for j in JOINTS:
             pb.changeDynamics(finger, j, localInertiaDiagonal=INERTIA[j],
-                              lateralFriction=self.finger_friction, linearDamping=0,
-                              angularDamping=0, jointDamping=0, **self._world)
-            pb.changeDynamics(finger, j, jointLowerLimit=JOINT_LOW[j],
-                              jointUpperLimit=JOINT_HIGH[j], **self._world)
+                              lateralFriction=self.finger_friction, jointLowerLimit=JOINT_LOW[j],
+                              jointUpperLimit=JOINT_HIGH[j], linearDamping=0, angularDamping=0,
+                              jointDamping=0, **self._world)
         if self.motor == "torque":                             # Bullet's own motors off
             pb.setJointMotorControlArray(finger, JOINTS, pb.VELOCITY_CONTROL, forces=[0] * 3,
                                          **self._world)
+        if self.render_mode:
+            orange, metal, black = (0.95, 0.55, 0.15, 1), (0.45, 0.47, 0.52, 1), (0.2, 0.2, 0.23, 1)
+            for link, color in zip((-1, *JOINTS), (metal, black, metal, orange)):
+                pb.changeVisualShape(finger, link, rgbaColor=color, **self._world)
         return finger
 
     def _finger_skins(self):
-        """Visual shapes of base, upper, middle and lower link: a bar with a ball at its joint."""
+        """Visual shapes of base, upper, middle and lower link: a ball, and a bar from it."""
         if not self.render_mode:
             return [-1] * 4
-        bars = (((BASE, 0, 0), (0, 0, 0), 0.018, 0.018),       # from, to, radii of bar and ball
-                ((0, 0, 0), (-0.10, 0, 0), 0.017, 0.021),
-                ((0, 0, 0), KNEE, 0.013, 0.019),
-                ((0, 0, 0), TIP_PLACE, TIP, 0.016))
+        bars = (((BASE, 0, 0), 0.018, 0.018),                  # end, radii of bar and ball, m
+                ((-0.10, 0, 0), 0.017, 0.021),
+                (KNEE, 0.013, 0.019),
+                (TIP_PLACE, TIP, 0.016))
         skins = []
-        for start, end, radius, ball in bars:
-            x, y, z = np.subtract(end, start)
+        for (x, y, z), radius, ball in bars:
             length = math.hypot(x, y, z)
             along = pb.getQuaternionFromEuler([0, math.acos(z / length), math.atan2(y, x)])
-            middle = np.add(start, end) / 2
             skins.append(pb.createVisualShapeArray(
                 [pb.GEOM_CAPSULE, pb.GEOM_SPHERE], radii=[radius, ball], lengths=[length, 0],
-                visualFramePositions=[middle.tolist(), [0, 0, 0]],
+                visualFramePositions=[[x / 2, y / 2, z / 2], [0, 0, 0]],
                 visualFrameOrientations=[along, (0, 0, 0, 1)], **self._world))
         return skins
 
@@ -393,8 +393,8 @@ class TriFingerEnv(Env):
         """Draw poses (x, y, yaw) of goal, target and distractors, in this order: (N+2, 3).
 
         Goal and target come first, inside GRASP_RADIUS, so that their distribution is the same for
-        all N; distractors lie anywhere in the arena. All uniform by area (distractors until one has
-        to be nudged); nothing overlaps, nothing lies on the goal or touches a finger.
+        all N; distractors lie anywhere in the arena. All uniform by area, but for distractors that
+        were nudged; nothing overlaps, nothing lies on the goal or touches a finger.
         """
         placed = [[*forward_kinematics(k, REST)[:2], 0.0, TIP_HALF_EDGE] for k in range(3)]
         self._add_square(placed, GRASP_RADIUS, self.goal_yaw)              # the goal
@@ -418,14 +418,10 @@ class TriFingerEnv(Env):
                 return
             if len(placed) > fixed:
                 moved = placed.pop(int(self._np_random.integers(fixed, len(placed))))
-                placed.append(self._nudged(moved, placed))
+                steps = self._np_random.normal(size=(64, 4)) * [0.01, 0.01, 0.2, 0.0]   # m, m, rad
+                new = np.concatenate([moved + steps, [moved]])             # at worst: back again
+                placed.append(new[self._are_free(new, placed).argmax()])
         raise ValueError(f"the arena cannot hold {self.distractors + 1} cubes: no free place found")
-
-    def _nudged(self, square, placed):
-        """A distractor moved a little, to wherever it is free; at worst where it was."""
-        steps = self._np_random.normal(size=(64, 4)) * [0.01, 0.01, 0.2, 0.0]   # m, m, rad
-        new = np.concatenate([square + steps, [square]])
-        return new[self._are_free(new, placed).argmax()]
 
     def _draw_squares(self, radius, yaw, count=64):
         """(count, 4) candidates, uniform in the disc; a yaw within 45 degrees is every yaw."""
@@ -492,13 +488,13 @@ class TriFingerEnv(Env):
     def step(self, action):
         """Apply action (9,) in [-1, 1] (beyond: clipped).
 
-        Returns (observation, reward, terminated, truncated, info). ValueError for an action that
-        is not nine finite numbers; RuntimeError if reset() has to come first: at the beginning, and
-        after the physics diverged.
+        Returns (observation, reward, terminated, truncated, info). RuntimeError if reset() has to
+        come first: at the beginning, and after the physics diverged.
         """
         if self._steps is None:
             raise RuntimeError("call reset() before step()")
-        action = nine_numbers(action)
+        action = np.asarray(action, np.float64).reshape(9).tolist()
+        action = clip(action, (-1.0,) * 9, (1.0,) * 9)
         self._joint_targets = self._targets_after(action)
         self._drive()
         self._steps += 1
@@ -521,7 +517,7 @@ class TriFingerEnv(Env):
     def _targets_after(self, action):
         """Joint targets (9,) in rad that an action asks for."""
         if self.action_mode == "integrated":
-            # Targets that stay press on: a grip outlives the action that made it.
+            # The target stays where it was put, so the motor keeps pressing and a grip lasts.
             moved = [target + self.action_scale * a
                      for target, a in zip(self._joint_targets, action)]
             targets = clip(moved, [q - LEAD for q in self._q], [q + LEAD for q in self._q])
@@ -581,7 +577,7 @@ class TriFingerEnv(Env):
             if not (x * x + y * y < OUTSIDE ** 2 and BELOW < z < ABOVE):
                 reason = LEFT
         self._cube_rows = rows
-        # Full speed of all joints adds up to about 80 rad/s. Written so that NaN fails it.
+        # 1000 rad/s is far above any real speed. Written so that NaN fails it, too.
         if math.isfinite(sum(rows)) and sum(map(abs, self._dq)) < 1000:
             return reason
         return DIVERGED
@@ -636,7 +632,7 @@ class TriFingerEnv(Env):
             "curiosity": far * math.log(moved + 1e-5),
             "reach": before.to_tips - now.to_tips,
         }
-        return {name: self.reward_weights[name] * term for name, term in terms.items()}
+        return {name: weight * terms[name] for name, weight in self.reward_weights.items()}
 
     def _diverged(self):
         """Last step of an episode whose state is no longer numbers: the next reset builds anew."""
@@ -648,14 +644,10 @@ class TriFingerEnv(Env):
     # ---- pictures
 
     def _paint(self):
-        """Show the goal, and colour the bodies (figure 1: target blue, distractors red)."""
+        """Show the goal and colour the cubes as in figure 1: target blue, distractors red."""
         for i, cube in enumerate(self._cubes):
             color = [0.15, 0.35, 0.9, 1] if i == self.target else [0.85, 0.2, 0.2, 1]
             pb.changeVisualShape(cube, -1, rgbaColor=color, **self._world)
-        orange, metal, plastic = (0.95, 0.55, 0.15, 1), (0.45, 0.47, 0.52, 1), (0.2, 0.2, 0.23, 1)
-        for finger in self._fingers:
-            for link, color in zip((-1, *JOINTS), (metal, plastic, metal, orange)):
-                pb.changeVisualShape(finger, link, rgbaColor=color, **self._world)
         self._show_goal(*self.goal)
 
     def _show_goal(self, position, quaternion=(0, 0, 0, 1)):
@@ -691,30 +683,6 @@ class TriFingerEnv(Env):
         if self._client is not None:
             pb.disconnect(self._client)
         self._client = self._steps = None
-
-
-def check_names(task, action_mode, motor, reward_weights, render_mode):
-    """ValueError with one line if one of TriFingerEnv's words is none that it knows."""
-    for name, got, known in (("task", task, ("push", "lift")),
-                             ("action_mode", action_mode, ("integrated", "absolute")),
-                             ("motor", motor, ("position", "torque")),
-                             ("render_mode", render_mode, (None, "rgb_array", "human"))):
-        if got not in known:
-            raise ValueError(f"{name} must be one of {known}, got {got!r}")
-    unknown = set(reward_weights or {}) - set(REWARD_WEIGHTS)
-    if unknown:
-        raise ValueError(f"reward_weights knows {list(REWARD_WEIGHTS)}, got {sorted(unknown)}")
-    if render_mode == "human" and sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        raise ValueError("a window needs a screen, and DISPLAY is not set; 'rgb_array' needs none")
-
-
-def nine_numbers(action):
-    """The action as nine floats in [-1, 1]; ValueError if it is not nine finite numbers."""
-    array = np.asarray(action, dtype=np.float64)
-    numbers = array.tolist()
-    if array.shape != (9,) or not all(map(math.isfinite, numbers)):
-        raise ValueError(f"action must be nine finite numbers, shape (9,), got {action!r}")
-    return clip(numbers, (-1.0,) * 9, (1.0,) * 9)
 
 
 if gymnasium is not None:                # gymnasium.make("TriFingerLift-v0", distractors=2)

@@ -241,7 +241,7 @@ def main():
     add("--distractors", type=evaluate.numbers, default=[0, 2, 5, 9], metavar="LIST",
         help="N of the table, default 0,2,5,9")
     add("--crowd", type=evaluate.numbers, metavar="LIST", help="sizes of crowds, as 10-15")
-    add("--episodes", type=evaluate.positive, default=200, metavar="E", help="default 200")
+    add("--episodes", type=int, default=200, metavar="E", help="default 200")
     add("--figures", action="store_true", help="write the CSVs of figures 6, 7 and 8")
     args = parser.parse_args()
     torch.set_num_threads(1)

@@ -22,7 +22,6 @@ import torch
 HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path.insert(0, os.path.dirname(HERE))
 from attn import ATTN
-from evaluate import positive
 from lrn import LRN
 from ppo import PPO
 from rn import RN
@@ -171,7 +170,7 @@ def main():
     parser = argparse.ArgumentParser(description="Speed (see the first lines of speed.py).")
     parser.error = fail
     parser.add_argument("sections", nargs="*", help=f"of {', '.join(SECTIONS)} (default: all)")
-    parser.add_argument("--rounds", type=positive, metavar="R", help="default 21, 5 and 25")
+    parser.add_argument("--rounds", type=int, metavar="R", help="default 21, 5 and 25")
     args = parser.parse_args()
     if not set(args.sections) <= set(SECTIONS):
         fail(f"the sections are {', '.join(SECTIONS)}")
