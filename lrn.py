@@ -47,8 +47,7 @@ class LRN(nn.Module):
         """All r_i = g_theta(o_i, o_goal): objects (B, K, D), goal (B, D) -> (B, K, D)."""
         if not self.with_goal:
             return self.g(objects)                             # (B, K, D)
-        B, K, D = objects.shape
-        goals = goal.view(B, 1, D).expand(B, K, D)             # the goal beside each object
+        goals = goal[:, None].expand(-1, objects.shape[1], -1)             # (B, K, D), all the same
         return self.g(torch.cat([objects, goals], dim=2))      # (B, K, 2D) -> (B, K, D)
 
     def forward(self, objects, goal):
