@@ -1577,19 +1577,6 @@ def test_killed_in_its_third_update_and_resumed_equals_never_stopped(
     assert not (out / "zeroshot.csv").exists()
 
 
-def test_killed_at_random_moments_and_resumed_equals_never_stopped(tmp_path):
-    whole, cut, rng = tmp_path / "whole", tmp_path / "cut", np.random.default_rng()
-    never_stopped = command("--out", whole, *SMALL, "frames=400")
-    process = started("--out", cut, *SMALL, "frames=400")
-    for _ in range(3):
-        time.sleep(rng.uniform(0, 0.5))
-        process.kill()
-        process.join()
-        process = command("--resume", cut)
-    assert process.end()[0] == never_stopped.end()[0] == 0
-    assert_same_run(cut, whole)
-
-
 def test_ctrl_c_ends_at_once_with_one_line_and_the_run_goes_on_from_there(finished, tmp_path):
     process, begin = started("--out", tmp_path, *SMALL), time.monotonic()
     os.kill(process.pid, signal.SIGINT)
@@ -1940,6 +1927,41 @@ def test_film_shows_one_episode(substeps, pictures, milliseconds, simple, tmp_pa
         first = np.array(film.convert("RGB"), int)
         film.seek(pictures - 1)
         assert np.abs(np.array(film.convert("RGB"), int) - first).max() > 50
+
+
+# ---------------------------------------------------------------- results/
+
+@pytest.fixture
+def results_script(monkeypatch, tmp_path):
+    """Runs a script of results/ in this process, in a folder of its own."""
+    monkeypatch.syspath_prepend(os.path.join(HERE, "results"))
+    monkeypatch.chdir(tmp_path)
+
+    def run_script(name, *words):
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, words)])
+        module = __import__(name)
+        module.main()
+        return module
+
+    yield run_script
+    torch.set_grad_enabled(True)                               # inside.py turns them off
+
+
+def test_inside_looks_into_a_run(evaluated, results_script, capsys):
+    inside = results_script("inside", evaluated[0], "--distractors", "0,3", "--episodes", "2")
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [row[0] for row in rows[1:]] == ["N", "0", "3"]
+    cubes = torch.zeros(2, 2, 18)                              # the target lies at (0, 0)
+    cubes[:, 1, tri.POSITION] = torch.tensor([[0.05, 0.03, 0], [0.05, 0.08, 0]]) / 0.2
+    goal = torch.zeros(2, 12)
+    goal[:, tri.POSITION] = torch.tensor([0.1, 0, 0]) / 0.2
+    assert inside.is_blocked({"cubes": cubes, "goal": goal}).tolist() == [True, False]
+
+
+def test_figures_draws_the_curves_of_any_run(evaluated, results_script, tmp_path):
+    pytest.importorskip("matplotlib").use("Agg")
+    results_script("figures", evaluated[0])
+    assert (tmp_path / "runs.png").stat().st_size > 10_000
 
 
 # ---------------------------------------------------------------- modules
