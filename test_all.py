@@ -1561,7 +1561,7 @@ def killed(out, monkeypatch, owner, name, call, after=False):
 
 @pytest.mark.parametrize("owner, name, call, after, saved", [
     (PPO, "minibatch_step", 37, False, 2),                     # 15 in an update
-    (train.Run, "save", 3, False, 2),                          # its row is written by then
+    (train, "save", 3, False, 2),                              # its row is written by then
     (os, "fsync", 7, False, 2),                                # its checkpoint is half written
     (os, "replace", 4, True, 3)])                              # it is in place
 def test_killed_in_its_third_update_and_resumed_equals_never_stopped(

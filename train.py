@@ -302,64 +302,32 @@ def replace(path, content):
     os.replace(path + ".tmp", path)
 
 
-class Run:
-    """The folder of a run and how far it has come; rank 0 alone writes to it."""
+def open_progress(path, update):
+    """Make progress.csv, or cut it to the rows that the checkpoint knows."""
+    lines = [",".join(PROGRESS) + "\n"]
+    if update:
+        with open(path) as file:
+            lines = file.readlines()[:1 + update]
+    replace(path, "".join(lines).encode())
 
-    def __init__(self, args, settings, learner):
-        self.args, self.settings, self.learner = args, settings, learner
-        self.update, self.seconds = 0, 0.0
-        self.frames_per_update = settings["envs"] * settings["steps"]
-        self.last_update = math.ceil(settings["frames"] / self.frames_per_update)
-        if args.checkpoint:
-            learner.load_state_dict(args.checkpoint["learner"])
-            learner.optimizer.load_state_dict(args.checkpoint["optimizer"])
-            self.update, self.seconds = args.checkpoint["update"], args.checkpoint["seconds"]
 
-    def path(self, name):
-        return os.path.join(self.args.out, name)
+def add_row(path, row):
+    """Append a row (dict) to progress.csv."""
+    cells = [row[key] if isinstance(row[key], int) else f"{row[key]:.6g}" for key in PROGRESS]
+    with open(path, "a", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerow(cells)
+        file.flush()
+        os.fsync(file.fileno())
 
-    def open(self):
-        """Make the folder ready: progress.csv with the rows up to the checkpoint."""
-        lines = [",".join(PROGRESS) + "\n"]
-        if self.args.checkpoint:
-            with open(self.path("progress.csv")) as file:
-                lines = file.readlines()[:1 + self.update]
-        replace(self.path("progress.csv"), "".join(lines).encode())
 
-    def write(self, row, elapsed):
-        """Save the run after an update: its row, then the checkpoint. Print a line."""
-        frames = self.update * self.frames_per_update
-        row = {"update": self.update, "frames": frames, **row}
-        with open(self.path("progress.csv"), "a", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerow(
-                [row[key] if isinstance(row[key], int) else f"{row[key]:.6g}" for key in PROGRESS])
-            file.flush()
-            os.fsync(file.fileno())
-        for scores in ("zeroshot.csv", "zeroshot-sampled.csv"):            # of the weights before
-            if os.path.exists(self.path(scores)):
-                os.remove(self.path(scores))
-        self.save(frames)
-        left = (self.last_update - self.update) * self.seconds / self.update / 60
-        print(f"{frames:8d} frames  success {row['success']:.2f}  return {row['return']:7.0f}  "
-              f"read-out {row['auxiliary_loss']:.4f}  std {row['std']:.2f}  "
-              f"{self.frames_per_update / elapsed:5.0f} frames/s  {left:4.0f} min left", flush=True)
-
-    def save(self, frames):
-        """All that is needed to go on. The random state of a run is its seed and its update."""
-        buffer = io.BytesIO()
-        torch.save({
-            **{name: getattr(self.args, name)
-               for name in ("encoder", "task", "distractors", "seed", "ranks")},
-            "settings": self.settings,
-            "update": self.update,
-            "frames": frames,
-            "seconds": self.seconds,
-            "versions": {"torch": str(torch.__version__), "numpy": np.__version__,
-                         "pybullet": version("pybullet")},
-            "learner": self.learner.state_dict(),
-            "optimizer": self.learner.optimizer.state_dict(),
-        }, buffer)
-        replace(self.path("checkpoint.pt"), buffer.getvalue())
+def save(checkpoint, folder):
+    """Replace the checkpoint of a run, and remove the scores of the weights before."""
+    for name in ("zeroshot.csv", "zeroshot-sampled.csv"):
+        if os.path.exists(os.path.join(folder, name)):
+            os.remove(os.path.join(folder, name))
+    buffer = io.BytesIO()
+    torch.save(checkpoint, buffer)
+    replace(os.path.join(folder, "checkpoint.pt"), buffer.getvalue())
 
 
 # ---- training
@@ -377,6 +345,22 @@ def make_learner(args, settings):
     agent = Agent(args.encoder, args.distractors, settings)
     worlds = [make_env(args.task, args.distractors, settings) for _ in range(envs)]
     return PPO(agent, worlds, **{name: settings[name] for name in LEARNER})
+
+
+def start(args, settings, learner):
+    """The state of a run: a new one, or the one to go on with, whose weights the learner takes up.
+
+    All that is needed to go on stands in it: a run's random state is its seed and its update.
+    """
+    if args.checkpoint is None:
+        names = ("encoder", "task", "distractors", "seed", "ranks")
+        return {**{name: getattr(args, name) for name in names}, "settings": settings, "update": 0,
+                "frames": 0, "seconds": 0.0, "versions": {
+                    "torch": str(torch.__version__), "numpy": np.__version__,
+                    "pybullet": version("pybullet")}}
+    learner.load_state_dict(args.checkpoint.pop("learner"))
+    learner.optimizer.load_state_dict(args.checkpoint.pop("optimizer"))
+    return args.checkpoint
 
 
 def summarize(episodes):
@@ -398,23 +382,36 @@ def summarize(episodes):
     return {**means, "episodes": int(sums[0]), "cut_short": int(sums[-1])}
 
 
-def train(run, rank):
+def train(folder, state, learner, rank):
     """Play a batch, learn from it, write down what came of it; again until all frames are played.
 
+    `state` is the checkpoint without learner and optimiser: how far the run has come.
     FloatingPointError if the training diverges; the last checkpoint stays as it was.
     """
-    learner = run.learner
-    while run.update < run.last_update:
+    settings, progress = state["settings"], os.path.join(folder, "progress.csv")
+    batch = settings["envs"] * settings["steps"]               # frames of an update
+    last_update = math.ceil(settings["frames"] / batch)
+    if rank == 0:
+        open_progress(progress, state["update"])
+    while state["update"] < last_update:
         begin = time.monotonic()
-        seeds = reseed(learner, run.args.seed, run.update, rank)
+        seeds = reseed(learner, state["seed"], state["update"], rank)
         episodes = learner.rollout(seeds)
-        stats = learner.update(remaining=1 - run.update / run.last_update)
+        stats = learner.update(remaining=1 - state["update"] / last_update)
         row = {**summarize(episodes), "std": learner.agent.log_std.exp().mean().item(), **stats}
         elapsed = time.monotonic() - begin
-        run.update += 1
-        run.seconds += elapsed
-        if rank == 0:
-            run.write(row, elapsed)
+        state["update"] += 1
+        state["frames"] += batch
+        state["seconds"] += elapsed
+        if rank > 0:
+            continue
+        add_row(progress, {"update": state["update"], "frames": state["frames"], **row})
+        save({**state, "learner": learner.state_dict(),
+              "optimizer": learner.optimizer.state_dict()}, folder)
+        left = (last_update - state["update"]) * state["seconds"] / state["update"] / 60
+        print(f"{state['frames']:8d} frames  success {row['success']:.2f}  return "
+              f"{row['return']:7.0f}  read-out {row['auxiliary_loss']:.4f}  std {row['std']:.2f}  "
+              f"{batch / elapsed:5.0f} frames/s  {left:4.0f} min left", flush=True)
 
 
 # ---- the command line
@@ -541,18 +538,17 @@ def main():
         fail(f"--out {args.out} cannot be written: {error.strerror}")
     if args.ranks > 1:
         dist.init_process_group("gloo")
-    run = Run(args, settings, learner)
+    state = start(args, settings, learner)
     try:
-        if rank == 0:
-            run.open()
-        train(run, rank)
+        train(args.out, state, learner, rank)
     except (FloatingPointError, KeyboardInterrupt) as error:   # on every rank alike: one says so
         if rank == 0:
-            print(f"{str(error) or 'stopped'} after {run.update} updates, saved in {args.out}",
+            print(f"{str(error) or 'stopped'}; whole updates are saved in {args.out}",
                   file=sys.stderr)
         sys.exit(STOPPED if isinstance(error, KeyboardInterrupt) else 1)
     if rank == 0:
-        print(f"finished after {run.update} updates, {run.seconds / 60:.1f} minutes: {args.out}")
+        print(f"finished after {state['update']} updates, {state['seconds'] / 60:.1f} minutes: "
+              f"{args.out}")
     if args.ranks > 1:
         dist.destroy_process_group()
 
