@@ -8,10 +8,9 @@
 
 Episode j starts from the same seed at every N and for every agent: goal, target cube and the first
 distractors stand in the same places (unless a crowd has to be nudged, as in nearly all episodes at
-N = 14, or an agent was trained with another goal_yaw). What is drawn after them differs:
-identifiers, the target's row and a lifting goal's height. The seeds belong to no training run (but
-one with --seed 20220131). The paper does not say whether its scores are of sampled actions or of
-the policy's means; CausalWorld's evaluation plays the means, and so do we.
+N = 14, or an agent was trained with another goal_yaw); identifiers, the target's row and a lifting
+goal's height differ. The paper does not say whether its scores are of sampled actions or of the
+policy's means; CausalWorld's evaluation plays the means, and so do we.
 
 The table's columns are means over episodes: success, the share of the goal's axis-aligned box that
 the cube's box covers at the last step, as in CausalWorld; strict, the same by the cubes' true
@@ -38,7 +37,7 @@ from trifinger_env import DIVERGED, SOLVED, TIME
 COLUMNS = ("distractors", "episodes", "success", "ci95", "success_strict", "ci95_strict", "solved",
            "cut_short")
 CHUNK = 25                               # episodes side by side; another number may change bits
-EVALUATION = 20220131                    # keeps these seeds apart from training's
+EVALUATION = 20220131                    # as a run's seed: keeps episodes apart from training's
 STARTS, NOISE = 0, 1                     # what an episode draws: see derived_seed()
 PICTURE_PERIOD = 0.08                    # s between two pictures of a film, about
 
