@@ -4,7 +4,7 @@
     python evaluate.py RUN [RUN ...] --distractors 0-9,14 --save       and RUN/zeroshot.csv
     python evaluate.py RUN --sample-actions                  with the noise of training
     python evaluate.py RUN --watch                           watch it play, live in a window
-    python evaluate.py RUN --gif push.gif --distractors 9    a film of one episode
+    python evaluate.py RUN RUN --gif push.gif --distractors 9          a film, side by side
 
 Episode j starts from the same seed at every N and for every agent: goal, target cube and the first
 distractors stand in the same places (unless a crowd has to be nudged, as in nearly all episodes at
@@ -40,6 +40,7 @@ CHUNK = 25                               # episodes side by side; another number
 EVALUATION = 20220131                    # as a run's seed: keeps episodes apart from training's
 STARTS, NOISE = 0, 1                     # what an episode draws: see derived_seed()
 PICTURE_PERIOD = 0.08                    # s between two pictures of a film, about
+PICTURE = 400, 300                       # width and height of one
 
 
 # ---- playing
@@ -165,7 +166,7 @@ def evaluate(run, args):
           f"{checkpoint['distractors']} distractors, {checkpoint['frames']} frames")
     with open(file, "rb") as opened:
         content = opened.read()
-    rows = sweep(content, numbers, args.episodes, args.sample_actions)
+    rows = sweep(content, numbers, args.episodes or 200, args.sample_actions)
     if args.save:
         if load(file)[0]["update"] != checkpoint["update"]:
             raise ValueError(f"{run} was trained on meanwhile: its scores are not saved")
@@ -210,25 +211,48 @@ def watch(run, distractors, episodes, sample_actions):
         print("the window was closed")
 
 
-@torch.inference_mode()
-def film(run, distractors, sample_actions, path):
-    """Write the first evaluation episode as an animated GIF."""
-    try:
-        from PIL import Image
-    except ImportError:
-        raise ValueError("--gif needs pillow: pip install pillow") from None
+def shoot(run, distractors, episode, sample_actions):
+    """An evaluation episode: pictures (300, 400, 3) with captions, and ms from one to the next."""
     checkpoint, agent = load(run)
     env = make_env(checkpoint["task"], distractors, checkpoint["settings"], "rgb_array")
     seconds = env.substeps * env.timestep                      # of an action
     every = max(1, round(PICTURE_PERIOD / seconds))            # actions from picture to picture
-    pictures = []
-    for step, info in enumerate(play_live(agent, env, 0, sample_actions)):
-        if step % every == 0 and info.get("truncated_by") != DIVERGED:     # that has no picture
-            pictures.append(Image.fromarray(env.render(320, 240)))
+    name = checkpoint["encoder"].upper()
+    if not checkpoint["settings"]["crowd"]:
+        name += " without crowds"
+    shots = []
+    for step, info in enumerate(play_live(agent, env, episode, sample_actions)):
+        is_sound = info.get("truncated_by") != DIVERGED        # else there is no picture
+        if is_sound and (step % every == 0 or "truncated_by" in info):
+            score = info["fractional_success"]
+            shots.append((env.render(*PICTURE), f"{name}, N = {distractors}, score {score:.2f}"))
     env.close()
-    pictures[0].save(path, save_all=True, append_images=pictures[1:],
-                     duration=round(1000 * every * seconds), loop=0)
-    print(f"wrote {path}: {distractors} distractors, success {info['fractional_success']:.2f}")
+    return shots, round(1000 * every * seconds)
+
+
+@torch.inference_mode()
+def film(runs, distractors, episodes, sample_actions, path):
+    """Write evaluation episodes as an animated GIF, the runs side by side from the same starts."""
+    try:
+        from PIL import Image, ImageDraw
+    except ImportError:
+        raise ValueError("--gif needs pillow: pip install pillow") from None
+    pictures = []
+    for episode in range(episodes):
+        panels, periods = zip(*[shoot(run, distractors, episode, sample_actions) for run in runs])
+        length = max(map(len, panels)) + 10                    # the end is shown for a while
+        panels = [shots + shots[-1:] * (length - len(shots)) for shots in panels]
+        for moment in zip(*panels):
+            picture = Image.fromarray(np.concatenate([shot for shot, _ in moment], axis=1))
+            for panel, (_, caption) in enumerate(moment):
+                place = PICTURE[0] * panel + 8, 6
+                ImageDraw.Draw(picture).text(place, caption, "black", font_size=16)
+            pictures.append(picture)
+    colors = pictures[0].quantize(64)                          # the same in all: nothing flickers
+    first, *others = [picture.quantize(palette=colors, dither=Image.Dither.NONE)
+                      for picture in pictures]
+    first.save(path, save_all=True, append_images=others, duration=periods[0], loop=0)
+    print(f"wrote {path}: {episodes} episodes, {distractors} distractors")
 
 
 # ---- the command line
@@ -253,15 +277,15 @@ def read_command():
     add("--distractors", type=numbers, metavar="LIST",
         help="numbers of distractors, as 0-9 or 0,2,14 (default 0-9); to watch or film: "
              "the smallest of them (default: as trained)")
-    add("--episodes", type=int, default=200, metavar="E",
-        help="episodes at each N (default 200)")
+    add("--episodes", type=int, metavar="E",
+        help="episodes at each N (default 200), or of a film (default 3)")
     add("--sample-actions", action="store_true",
         help="sample actions as in training instead of playing the policy's means")
     add = parser.add_mutually_exclusive_group().add_argument
     add("--save", action="store_true",
         help="write the rows to RUN/zeroshot.csv (zeroshot-sampled.csv for sampled actions)")
     add("--watch", action="store_true", help="play the first run live in a window")
-    add("--gif", metavar="FILE.gif", help="film one episode of the first run")
+    add("--gif", metavar="FILE.gif", help="film the runs side by side")
     return parser.parse_args()
 
 
@@ -272,9 +296,9 @@ def main():
             run = args.runs[0]
             distractors = args.distractors[0] if args.distractors else load(run)[0]["distractors"]
             if args.gif:
-                film(run, distractors, args.sample_actions, args.gif)
+                film(args.runs, distractors, args.episodes or 3, args.sample_actions, args.gif)
             else:
-                watch(run, distractors, args.episodes, args.sample_actions)
+                watch(run, distractors, args.episodes or 200, args.sample_actions)
             return
         for run in args.runs:
             evaluate(run, args)

@@ -1916,17 +1916,25 @@ def test_watching_plays_the_evaluated_episodes(simple, monkeypatch, capsys):
     assert [line.split()[-1] for line in lines] == [f"{rho:.2f}" for rho in expected]
 
 
-@pytest.mark.parametrize("substeps, pictures, milliseconds", [(5, 8, 80), (20, 16, 160)])
-def test_film_shows_one_episode(substeps, pictures, milliseconds, simple, tmp_path):
-    """15 steps at 25 Hz: pictures of the start and of every other step; at 6.25 Hz of every one."""
+@pytest.mark.parametrize("substeps, pictures, milliseconds", [(5, 9, 80), (20, 16, 160)])
+def test_film_shows_episodes_side_by_side(substeps, pictures, milliseconds, simple, tmp_path):
+    """15 steps at 25 Hz: start, every other step and the end; at 6.25 Hz every step. Then a rest."""
     Image = pytest.importorskip("PIL.Image")
     simple["settings"]["substeps"] = substeps
-    evaluate.film("simple", 2, False, str(tmp_path / "a.gif"))
+    evaluate.film(["simple", "simple"], 2, 2, False, str(tmp_path / "a.gif"))
     with Image.open(tmp_path / "a.gif") as film:
-        assert film.n_frames == pictures and film.info["duration"] == milliseconds
-        first = np.array(film.convert("RGB"), int)
-        film.seek(pictures - 1)
-        assert np.abs(np.array(film.convert("RGB"), int) - first).max() > 50
+        shown, durations = [], []
+        for i in range(film.n_frames):
+            film.seek(i)
+            shown.append(np.array(film.convert("RGB"), int))
+            durations.append(film.info["duration"])
+    assert shown[0].shape == (300, 800, 3)
+    assert len(shown) == 2 * pictures and durations[0] == milliseconds
+    assert durations[pictures - 1] == 11 * milliseconds        # equal pictures become one
+    for i in range(len(shown)):                                # the same run twice
+        assert np.abs(shown[i][30:, :400] - shown[i][30:, 400:]).max() == 0
+    assert np.abs(shown[pictures - 1] - shown[0]).max() > 50
+    assert np.abs(shown[pictures] - shown[0]).max() > 50       # another start
 
 
 # ---------------------------------------------------------------- results/

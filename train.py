@@ -410,7 +410,7 @@ def train(folder, state, learner, rank):
               "optimizer": learner.optimizer.state_dict()}, folder)
         left = (last_update - state["update"]) * state["seconds"] / state["update"] / 60
         print(f"{state['frames']:8d} frames  success {row['success']:.2f}  return "
-              f"{row['return']:7.0f}  read-out {row['auxiliary_loss']:.4f}  std {row['std']:.2f}  "
+              f"{row['return']:6.0f}  read-out {row['auxiliary_loss']:.4f}  "
               f"{batch / elapsed:5.0f} frames/s  {left:4.0f} min left", flush=True)
 
 

@@ -10,6 +10,7 @@ Shapes: observation {"cubes": (N+1, 18), "fingers": (3, 10), "goal": (12,)} floa
         action (9,) in [-1, 1].
 Run:    python trifinger_env.py        one episode of random actions, and frames/s
 """
+import itertools
 import math
 import time
 from typing import NamedTuple
@@ -384,8 +385,16 @@ class TriFingerEnv(Env):
             pb.changeDynamics(cube, -1, lateralFriction=CUBE_FRICTION, **self._world)
             self._cubes.append(cube)
         if self.render_mode:
-            green = self._skin([0.2, 0.8, 0.3, 0.5], half)
-            self._goal_picture = pb.createMultiBody(0, -1, green, **self._world)
+            self._goal_picture = pb.createMultiBody(0, -1, self._frame(), **self._world)
+
+    def _frame(self):
+        """Visual shape of the goal: the twelve edges of a cube, visible with a cube inside, too."""
+        half, thin = CUBE / 2, 0.0025
+        places = [np.insert(ends, axis, 0.0)
+                  for axis in range(3) for ends in itertools.product((-half, half), repeat=2)]
+        sizes = np.repeat(thin + half * np.eye(3), 4, axis=0)  # four bars along each axis
+        return pb.createVisualShapeArray([pb.GEOM_BOX] * 12, halfExtents=sizes.tolist(),
+                                         visualFramePositions=places, **self._world)
 
     # ---- the start of an episode
 
@@ -644,14 +653,13 @@ class TriFingerEnv(Env):
     # ---- pictures
 
     def _paint(self):
-        """Show the goal and colour the cubes as in figure 1: target blue, distractors red."""
+        """Place the goal and colour all as in figure 1: target blue, distractors red, goal green."""
         for i, cube in enumerate(self._cubes):
             color = [0.15, 0.35, 0.9, 1] if i == self.target else [0.85, 0.2, 0.2, 1]
             pb.changeVisualShape(cube, -1, rgbaColor=color, **self._world)
-        self._show_goal(*self.goal)
-
-    def _show_goal(self, position, quaternion=(0, 0, 0, 1)):
-        pb.resetBasePositionAndOrientation(self._goal_picture, position, quaternion, **self._world)
+        green = [0.1, 0.65, 0.25, 1]
+        pb.changeVisualShape(self._goal_picture, -1, rgbaColor=green, **self._world)
+        pb.resetBasePositionAndOrientation(self._goal_picture, *self.goal, **self._world)
 
     def render(self, width=480, height=360):
         """RGB picture (height, width, 3) uint8 of the arena, drawn on the CPU; needs no screen.
@@ -663,20 +671,13 @@ class TriFingerEnv(Env):
             raise RuntimeError("render() needs render_mode='rgb_array' and a reset() first")
         if self.render_mode == "human":
             return None
-        # TinyRenderer knows no transparency: blend two pictures.
-        with_goal = self._shot(width, height)
-        self._show_goal([0, 0, -1])
-        without_goal = self._shot(width, height)
-        self._show_goal(*self.goal)
-        return (0.5 * with_goal + 0.5 * without_goal).astype(np.uint8)
-
-    def _shot(self, width, height):
-        view = pb.computeViewMatrix([0.0, -0.72, 0.62], [0, 0, 0.1], [0, 0, 1])
-        lens = pb.computeProjectionMatrixFOV(45, width / height, 0.05, 3)
-        _, _, image, _, _ = pb.getCameraImage(
-            width, height, view, lens, shadow=1, lightDirection=[0.5, -1, 2],
+        view = pb.computeViewMatrix([0.0, -0.62, 0.74], [0, 0, 0.09], [0, 0, 1])
+        lens = pb.computeProjectionMatrixFOV(38, width / height, 0.05, 3)
+        _, _, image, _, _ = pb.getCameraImage(                 # twice the size, for smooth edges
+            2 * width, 2 * height, view, lens, shadow=1, lightDirection=[0.5, -1, 2],
             renderer=pb.ER_TINY_RENDERER, **self._world)
-        return np.reshape(image, (height, width, 4))[:, :, :3].astype(np.float32)
+        blocks = np.reshape(image, (height, 2, width, 2, 4))[..., :3]
+        return blocks.mean((1, 3)).astype(np.uint8)
 
     def close(self):
         """Disconnect from PyBullet; calling it twice is harmless, any other use then an error."""
