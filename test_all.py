@@ -1338,7 +1338,9 @@ def test_a_crowd_is_the_target_once_among_other_cubes_of_its_scene():
         if sizes[-1] == 5:
             columns += column.tolist()
             others += ((index - target[:, None]) % 4 - 1)[~is_target].tolist()
-    assert equally_likely(sizes, 6) and equally_likely(columns, 6) and equally_likely(others, 3)
+    assert equally_likely(columns, 6) and equally_likely(others, 3)
+    expected = [sum(1 / 6 / (most + 1) for most in range(size, 6)) for size in range(6)]
+    np.testing.assert_allclose(np.bincount(sizes) / 300, expected, atol=0.08)
 
 
 @pytest.mark.parametrize("encoder, N, crowd, expected", [

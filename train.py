@@ -222,10 +222,13 @@ class Agent(nn.Module):
 
         cubes (B, N+1, 18), target (B,) -> crowd (B, M+1, 18), the target's index in it (B,).
         At a fixed N the bias of f_phi can cancel whatever N distractors add to the sum. At a random
-        M it cannot, so a distractor has to add nothing.
+        M it cannot, so a distractor has to add nothing. M is uniform up to a number that is itself
+        uniform: were large crowds as frequent as small ones, RN and ATTN would read nothing for
+        long.
         """
         B, count = cubes.shape[:2]
-        M = int(torch.randint(self.largest_crowd + 1, (), generator=self.crowds))
+        most = int(torch.randint(self.largest_crowd + 1, (), generator=self.crowds))
+        M = int(torch.randint(most + 1, (), generator=self.crowds))
         if count == 1:                                         # no distractor to make a crowd of
             return cubes, target
         rows, column = torch.arange(B), torch.randint(M + 1, (B,))

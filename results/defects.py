@@ -186,6 +186,8 @@ DEFECTS = [
     ("train.py", "column = torch.arange(B), torch.randint(M + 1, (B,))",
      "column = torch.arange(B), torch.zeros(B, dtype=torch.long)",
      "test_a_crowd_is_the_target_once_among_other_cubes_of_its_scene"),
+    ("train.py", "torch.randint(most + 1, ()", "torch.randint(self.largest_crowd + 1, ()",
+     "test_a_crowd_is_the_target_once_among_other_cubes_of_its_scene"),
     ("train.py", "and not self.is_mlp and torch", "and torch",
      "test_half_of_the_minibatches_show_a_crowd_if_there_can_be_one"),
     ("train.py", "        if count == 1:", "        if False:",
