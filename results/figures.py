@@ -4,8 +4,8 @@
     python results/figures.py 3 readout         some of them
     python results/figures.py RUN [RUN ...]     learning and zero-shot curves of any runs: runs.png
 
-Reads results/runs/TASK-ENCODER-nN[-VARIANT]-seedS (reproduce.sh makes them), and for figures 6, 7
-and 8 what `python results/inside.py --figures` wrote. Writes results/figure3.png and so on.
+Reads results/runs/TASK-ENCODER-nN[-VARIANT]-seedS (reproduce.sh makes them), and for figures 6, 7,
+8 and relations what `python results/inside.py --figures` wrote. Writes results/figure3.png and so on.
 Runs that differ in the seed alone are a group: thin lines, and a thick one for their mean. A dotted
 line marks the N of training. Needs matplotlib, but neither torch nor PyBullet.
 """
@@ -35,6 +35,7 @@ TASKS = {                                # rows of figure 3 -> group of runs
     "PushingCube, without crowds": "push-{}-n2-nocrowd",
     "LiftingCube, with crowds": "lift-{}-n2",
     "LiftingCube, without crowds": "lift-{}-n2-nocrowd",
+    "PushingCube, the paper's world": "push-{}-n2-paperworld",
 }
 ABLATIONS = {                            # panels of figure 5 -> {group of runs: label}
     "Parts of LRN": {
@@ -192,7 +193,7 @@ def draw_frames_to(axes, encoder, score):
 
 def figure_3():
     """Figure 3: training at N = 2 and zero-shot scores, with and without crowds."""
-    figure, panels = plt.subplots(len(TASKS), 2, figsize=(9, 11), layout="constrained")
+    figure, panels = plt.subplots(len(TASKS), 2, figsize=(9, 14), layout="constrained")
     for (title, name), (left, right) in zip(TASKS.items(), panels):
         for encoder in PAPER:
             runs = runs_of(name.format(encoder))
@@ -300,6 +301,27 @@ def figure_readout():
     return figure
 
 
+def figure_relations():
+    """Not in the paper: what a distractor adds to LRN's sum, and the score among nine of them."""
+    figure, axes = plt.subplots(figsize=(5.5, 3.8), layout="constrained")
+    for is_plain, label, marker in ((False, "with crowds", "o"), (True, "without crowds", "^")):
+        rows = [row for row in read_rows("figurerelations.csv")
+                if ("-nocrowd" in row["run"]) == is_plain]
+        scores = [success_at(os.path.join(RUNS, row["run"]), 9) for row in rows]
+        axes.plot(numbers(rows, "share"), scores, marker, color=ENCODERS["lrn"][1],
+                  fillstyle="none" if is_plain else "full", markersize=8, label=label)
+    axes.set(xlabel="a distractor's mean relation / the target's", xscale="log",
+             ylabel="success at N = 9", ylim=(0, 1))
+    axes.legend()
+    return figure
+
+
+def success_at(run, N):
+    """A run's score at N distractors."""
+    table = read(run, "zeroshot.csv")
+    return table["success"][table["distractors"] == N][0]
+
+
 def figure_of(runs):
     """Learning and zero-shot curves of any runs."""
     groups = {}
@@ -321,7 +343,7 @@ def figure_of(runs):
 
 FIGURES = {
     "1": figure_1, "3": figure_3, "4": figure_4, "5": figure_5, "6": figure_6, "7": figure_7,
-    "8": figure_8, "readout": figure_readout,
+    "8": figure_8, "readout": figure_readout, "relations": figure_relations,
 }
 
 

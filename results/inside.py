@@ -2,7 +2,7 @@
 
     python results/inside.py RUN --distractors 0,2,9     a table by N
     python results/inside.py RUN --crowd 10-15           read error among 10 to 15 distractors
-    python results/inside.py --figures                   the numbers of figures 6, 7 and 8
+    python results/inside.py --figures                   the numbers of figures 6, 7, 8, relations
 
 The table: success; the same where the way from target to goal was clear and where a distractor
 blocked it; share of blocked ones; distance from the target cube to where the read-out sees it;
@@ -12,11 +12,14 @@ is made of scenes at the N of training, as Agent.crowd makes it: it judges the t
 look at a test N.
 --figures plays results/runs/push-{lrn,rn,attn}-n2-seed0 and writes figure6.csv (z at each N in the
 plane), figure6-drift.csv (distance of the z at N from those at 2), figure7.csv (LRN's relations in
-the plane) and figure8.csv (their lengths) in results/. Needs scikit-learn.
+the plane) and figure8.csv (their lengths) in results/; figurerelations.csv is of all seeds of LRN
+with and without crowds. Needs scikit-learn.
 """
 import argparse
 import csv
+import glob
 import os
+import re
 import sys
 
 import numpy as np
@@ -100,6 +103,12 @@ def relations_of(agent, obs):
     return agent.encoder.relations(*agent.tokens(obs)).roll(3, dims=1)     # fingers were last
 
 
+def distractors_share(agent, obs):
+    """Length of the distractors' mean relation, in units of the target's mean relation's (LRN)."""
+    r = relations_of(agent, obs)
+    return r[:, 4:].mean((0, 1)).norm() / r[:, 3].mean(0).norm()
+
+
 # ---- the tables
 
 def by_number(checkpoint, agent, N, episodes):
@@ -122,8 +131,7 @@ def by_number(checkpoint, agent, N, episodes):
         "drift of z": drift_of(agent.encode(obs), agent.encode(trained)),
     }
     if isinstance(agent.encoder, LRN):
-        r = relations_of(agent, obs)
-        row["relations"] = r[:, 4:].mean((0, 1)).norm() / r[:, 3].mean(0).norm()
+        row["relations"] = distractors_share(agent, obs)
     if checkpoint["task"] == "lift":
         height = 100 * POSITION_SCALE * obs["goal"][:, POSITION][:, 2]     # cm
         for low, high in BANDS:
@@ -233,6 +241,18 @@ def figure_8(episodes):
     write("figure8.csv", ("N", "step", *KINDS, "distractors"), rows)
 
 
+def figure_relations(episodes):
+    """What a distractor adds to LRN's sum, in every run with and without crowds."""
+    rows = []
+    for run in sorted(glob.glob(os.path.join(HERE, "runs", "push-lrn-n2*-seed*"))):
+        name = os.path.basename(run)
+        if re.fullmatch(r"push-lrn-n2(-nocrowd)?-seed\d+", name):
+            checkpoint, agent = load(run)
+            share = distractors_share(agent, starts(checkpoint, 9, episodes)).item()
+            rows.append((name, share))
+    write("figurerelations.csv", ("run", "share"), rows)
+
+
 def main():
     parser = argparse.ArgumentParser(description="Look inside agents (see the top of inside.py).")
     parser.error = fail
@@ -242,7 +262,7 @@ def main():
         help="N of the table, default 0,2,5,9")
     add("--crowd", type=evaluate.numbers, metavar="LIST", help="sizes of crowds, as 10-15")
     add("--episodes", type=int, default=200, metavar="E", help="default 200")
-    add("--figures", action="store_true", help="write the CSVs of figures 6, 7 and 8")
+    add("--figures", action="store_true", help="write the CSVs of these figures")
     args = parser.parse_args()
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
@@ -250,7 +270,7 @@ def main():
         for run in args.runs:
             print_table(run, args)
         if args.figures:
-            for figure in (figure_8, figure_7, figure_6):      # the quick ones first
+            for figure in (figure_relations, figure_8, figure_7, figure_6):    # quick ones first
                 figure(args.episodes)
     except ValueError as error:
         fail(str(error))
