@@ -14,6 +14,7 @@ import math
 import multiprocessing
 import os
 import pickle
+import re
 import runpy
 import shutil
 import signal
@@ -1937,6 +1938,19 @@ def test_film_shows_episodes_side_by_side(substeps, pictures, milliseconds, simp
         assert np.abs(shown[i][30:, :400] - shown[i][30:, 400:]).max() == 0
     assert np.abs(shown[pictures - 1] - shown[0]).max() > 50
     assert np.abs(shown[pictures] - shown[0]).max() > 50       # another start
+
+
+# ---------------------------------------------------------------- README
+
+def test_python_of_readme_runs_as_it_stands(evaluated, capsys):
+    with open(os.path.join(HERE, "README.md")) as file:
+        block = re.search(r"```python\n(.*?)```", file.read(), re.DOTALL)[1]
+    names = {}
+    exec(block.replace("RUN", str(evaluated[0])), names)
+    assert names["info"]["truncated_by"] == "time"
+    assert names["relations"].shape == (1, 8, 64)              # five cubes and three fingers
+    assert f"{names['info']['fractional_success']} {names['env'].target} tensor" in \
+        capsys.readouterr().out
 
 
 # ---------------------------------------------------------------- results/
