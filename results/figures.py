@@ -26,6 +26,7 @@ RUNS = os.path.join(HERE, "runs")
 WINDOW = 25                              # updates that a point of a training curve averages
 ENCODERS = {"lrn": ("LRN", "#0072B2"), "rn": ("RN", "#009E73"), "attn": ("ATTN", "#CC3311"),
             "mlp": ("MLP", "#777777")}   # in all figures: blue, green, red, grey
+LINES = {"RN": "--", "ATTN": "-."}       # for those who see no colours; others are solid
 PAPER = ("lrn", "rn", "attn")            # the paper's encoders
 OTHERS = ("#E69F00", "#AA4499", "black", "#56B4E9", "#8B5A2B")     # where an encoder's is taken
 KINDS = {"finger 0": "black", "finger 1": "saddlebrown", "finger 2": "red", "target": "green",
@@ -121,7 +122,8 @@ def draw_seeds(axes, curves, label, color, marker=None):
     points = [dict(zip(x, y)) for x, y in curves]
     shared = sorted(set.intersection(*map(set, points)))
     means = [np.mean([of_seed[x] for of_seed in points]) for x in shared]
-    axes.plot(shared, means, color=color, linewidth=2, marker=marker, markersize=4, label=label)
+    axes.plot(shared, means, color=color, linewidth=2, linestyle=LINES.get(label, "-"),
+              marker=marker, markersize=4, label=label)
 
 
 def draw_training(axes, runs, label, color, column="success"):
@@ -310,7 +312,7 @@ def figure_relations():
         scores = [success_at(os.path.join(RUNS, row["run"]), 9) for row in rows]
         axes.plot(numbers(rows, "share"), scores, marker, color=ENCODERS["lrn"][1],
                   fillstyle="none" if is_plain else "full", markersize=8, label=label)
-    axes.set(xlabel="a distractor's mean relation / the target's", xscale="log",
+    axes.set(xlabel="a distractor's mean relation / the target's", xlim=(0, None),
              ylabel="success at N = 9", ylim=(0, 1))
     axes.legend()
     return figure
