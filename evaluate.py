@@ -166,7 +166,7 @@ def evaluate(run, args):
           f"{checkpoint['distractors']} distractors, {checkpoint['frames']} frames")
     with open(file, "rb") as opened:
         content = opened.read()
-    rows = sweep(content, numbers, args.episodes or 200, args.sample_actions)
+    rows = sweep(content, numbers, args.episodes, args.sample_actions)
     if args.save:
         if load(file)[0]["update"] != checkpoint["update"]:
             raise ValueError(f"{run} was trained on meanwhile: its scores are not saved")
@@ -286,7 +286,12 @@ def read_command():
         help="write the rows to RUN/zeroshot.csv (zeroshot-sampled.csv for sampled actions)")
     add("--watch", action="store_true", help="play the first run live in a window")
     add("--gif", metavar="FILE.gif", help="film the runs side by side")
-    return parser.parse_args()
+    args = parser.parse_args()
+    if args.episodes is None:
+        args.episodes = 3 if args.gif else 200
+    if args.episodes < 1:
+        fail("--episodes must be at least 1")
+    return args
 
 
 def main():
@@ -296,9 +301,9 @@ def main():
             run = args.runs[0]
             distractors = args.distractors[0] if args.distractors else load(run)[0]["distractors"]
             if args.gif:
-                film(args.runs, distractors, args.episodes or 3, args.sample_actions, args.gif)
+                film(args.runs, distractors, args.episodes, args.sample_actions, args.gif)
             else:
-                watch(run, distractors, args.episodes or 200, args.sample_actions)
+                watch(run, distractors, args.episodes, args.sample_actions)
             return
         for run in args.runs:
             evaluate(run, args)

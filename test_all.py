@@ -1485,7 +1485,7 @@ def test_progress_tells_of_every_update(finished):
         expected = learner.update(remaining=1 - update / 4)
         expected.update({"update": update + 1, "frames": 50 * (update + 1), "episodes": 2,
                          "return": np.mean([episode["return"] for episode in episodes]),
-                         "lr": 2e-3 * (1 - update / 4),
+                         "lr": 2e-3 * (1 - update / 4) ** 1.5,
                          "std": learner.agent.log_std.exp().mean().item()})
         assert {name: row[name] for name in expected} == pytest.approx(expected, rel=1e-5)
     for name, weights in learner.state_dict().items():
