@@ -1923,7 +1923,7 @@ def test_watching_plays_the_evaluated_episodes(simple, monkeypatch, capsys):
 
 @pytest.mark.parametrize("substeps, pictures, milliseconds", [(5, 9, 80), (20, 16, 160)])
 def test_film_shows_episodes_side_by_side(substeps, pictures, milliseconds, simple, tmp_path):
-    """15 steps at 25 Hz: start, every other step and the end; at 6.25 Hz every step. Then a rest."""
+    """15 steps at 25 Hz: start, every other step, the end; at 6.25 Hz every step. Then a rest."""
     Image = pytest.importorskip("PIL.Image")
     simple["settings"]["substeps"] = substeps
     evaluate.film(["simple", "simple"], 2, 2, False, str(tmp_path / "a.gif"))

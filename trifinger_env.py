@@ -653,7 +653,7 @@ class TriFingerEnv(Env):
     # ---- pictures
 
     def _paint(self):
-        """Place the goal and colour all as in figure 1: target blue, distractors red, goal green."""
+        """Place the goal; colours as in figure 1: target blue, distractors red, goal green."""
         for i, cube in enumerate(self._cubes):
             color = [0.15, 0.35, 0.9, 1] if i == self.target else [0.85, 0.2, 0.2, 1]
             pb.changeVisualShape(cube, -1, rgbaColor=color, **self._world)

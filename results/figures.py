@@ -5,7 +5,7 @@
     python results/figures.py RUN [RUN ...]     learning and zero-shot curves of any runs: runs.png
 
 Reads results/runs/TASK-ENCODER-nN[-VARIANT]-seedS (reproduce.sh makes them), and for figures 6, 7,
-8 and relations what `python results/inside.py --figures` wrote. Writes results/figure3.png and so on.
+8 and relations what `python results/inside.py --figures` wrote. Writes results/figure3.png etc.
 Runs that differ in the seed alone are a group: thin lines, and a thick one for their mean. A dotted
 line marks the N of training. Needs matplotlib, but neither torch nor PyBullet.
 """
