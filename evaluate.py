@@ -90,6 +90,11 @@ def play(checkpoint, agent, distractors, episodes, sample_actions=False):
     return ends
 
 
+def in_chunks(episodes):
+    """A range of episodes as ranges of at most CHUNK, which are played side by side."""
+    return [episodes[first:first + CHUNK] for first in range(0, len(episodes), CHUNK)]
+
+
 # ---- the sweep over N
 
 def play_chunk(content, *arguments):
@@ -104,7 +109,7 @@ def sweep(content, numbers, episodes, sample_actions=False):
     Prints and returns rows of COLUMNS, each as soon as its N is done. BrokenProcessPool if a worker
     is killed.
     """
-    parts = [range(episodes)[first:first + CHUNK] for first in range(0, episodes, CHUNK)]
+    parts = in_chunks(range(episodes))
     pool = ProcessPoolExecutor(min(os.cpu_count(), len(numbers) * len(parts)),
                                multiprocessing.get_context("spawn"))
     print("   N  success           strict            solved", flush=True)
@@ -211,9 +216,8 @@ def watch(run, distractors, episodes, sample_actions):
         print("the window was closed")
 
 
-def shoot(run, distractors, episode, sample_actions):
+def shoot(checkpoint, agent, distractors, episode, sample_actions):
     """An evaluation episode: pictures (300, 400, 3) with captions, and ms from one to the next."""
-    checkpoint, agent = load(run)
     env = make_env(checkpoint["task"], distractors, checkpoint["settings"], "rgb_array")
     seconds = env.substeps * env.timestep                      # of an action
     every = max(1, round(PICTURE_PERIOD / seconds))            # actions from picture to picture
@@ -237,9 +241,10 @@ def film(runs, distractors, episodes, sample_actions, path):
         from PIL import Image, ImageDraw
     except ImportError:
         raise ValueError("--gif needs pillow: pip install pillow") from None
-    pictures = []
+    agents, pictures = [load(run) for run in runs], []
     for episode in range(episodes):
-        panels, periods = zip(*[shoot(run, distractors, episode, sample_actions) for run in runs])
+        panels, periods = zip(*[shoot(*agent, distractors, episode, sample_actions)
+                                for agent in agents])
         length = max(map(len, panels)) + 10                    # the end is shown for a while
         panels = [shots + shots[-1:] * (length - len(shots)) for shots in panels]
         for moment in zip(*panels):

@@ -386,6 +386,8 @@ class TriFingerEnv(Env):
             self._cubes.append(cube)
         if self.render_mode:
             self._goal_picture = pb.createMultiBody(0, -1, self._frame(), **self._world)
+            green = [0.1, 0.65, 0.25, 1]
+            pb.changeVisualShape(self._goal_picture, -1, rgbaColor=green, **self._world)
 
     def _frame(self):
         """Visual shape of the goal: the twelve edges of a cube, visible with a cube inside, too."""
@@ -653,12 +655,10 @@ class TriFingerEnv(Env):
     # ---- pictures
 
     def _paint(self):
-        """Place the goal; colours as in figure 1: target blue, distractors red, goal green."""
+        """Show the goal and colour the cubes as in figure 1: target blue, distractors red."""
         for i, cube in enumerate(self._cubes):
             color = [0.15, 0.35, 0.9, 1] if i == self.target else [0.85, 0.2, 0.2, 1]
             pb.changeVisualShape(cube, -1, rgbaColor=color, **self._world)
-        green = [0.1, 0.65, 0.25, 1]
-        pb.changeVisualShape(self._goal_picture, -1, rgbaColor=green, **self._world)
         pb.resetBasePositionAndOrientation(self._goal_picture, *self.goal, **self._world)
 
     def render(self, width=480, height=360):

@@ -97,11 +97,8 @@ def untrained_rows():
     agent = Agent("lrn", 2, DEFAULTS)
     for task, sampled, N in itertools.product(("push", "lift"), (False, True), (2, 9)):
         checkpoint = {"task": task, "settings": DEFAULTS}
-        ends = []
-        for first in range(0, EPISODES, evaluate.CHUNK):
-            part = range(first, first + evaluate.CHUNK)
-            ends += evaluate.play(checkpoint, agent, N, part, sampled)
-        scores = np.array([end["fractional_success"] for end in ends])
+        scores = np.array([end["fractional_success"] for part in evaluate.in_chunks(range(EPISODES))
+                           for end in evaluate.play(checkpoint, agent, N, part, sampled)])
         yield f"untrained, {task}, {'sampled actions' if sampled else 'mean actions'}", N, scores
 
 

@@ -19,7 +19,6 @@ import argparse
 import csv
 import glob
 import os
-import re
 import sys
 
 import numpy as np
@@ -113,10 +112,8 @@ def distractors_share(agent, obs):
 
 def by_number(checkpoint, agent, N, episodes):
     """A row of the table by N: {column: number}."""
-    ends = []
-    for first in range(0, episodes, evaluate.CHUNK):
-        part = range(episodes)[first:first + evaluate.CHUNK]
-        ends += evaluate.play(checkpoint, agent, N, part)
+    ends = [end for part in evaluate.in_chunks(range(episodes))
+            for end in evaluate.play(checkpoint, agent, N, part)]
     success = torch.tensor([end["fractional_success"] for end in ends])
     obs = starts(checkpoint, N, episodes)
     trained = starts(checkpoint, checkpoint["distractors"], episodes)
@@ -244,12 +241,11 @@ def figure_8(episodes):
 def figure_relations(episodes):
     """What a distractor adds to LRN's sum, in every run with and without crowds."""
     rows = []
-    for run in sorted(glob.glob(os.path.join(HERE, "runs", "push-lrn-n2*-seed*"))):
-        name = os.path.basename(run)
-        if re.fullmatch(r"push-lrn-n2(-nocrowd)?-seed\d+", name):
+    for group in ("push-lrn-n2", "push-lrn-n2-nocrowd"):
+        for run in sorted(glob.glob(os.path.join(HERE, "runs", f"{group}-seed*"))):
             checkpoint, agent = load(run)
             share = distractors_share(agent, starts(checkpoint, 9, episodes)).item()
-            rows.append((name, share))
+            rows.append((os.path.basename(run), share))
     write("figurerelations.csv", ("run", "share"), rows)
 
 

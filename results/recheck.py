@@ -34,9 +34,8 @@ def scores_of(run):
 def compare(run, N, row):
     """Print a line."""
     checkpoint, agent = load(run)
-    ends = []
-    for first in range(FIRST, FIRST + EPISODES, evaluate.CHUNK):
-        ends += evaluate.play(checkpoint, agent, N, range(first, first + evaluate.CHUNK))
+    ends = [end for part in evaluate.in_chunks(range(FIRST, FIRST + EPISODES))
+            for end in evaluate.play(checkpoint, agent, N, part)]
     again = evaluate.summary(N, ends)
     score, half = float(row["success"]), float(row["ci95"])
     is_within = abs(again["success"] - score) <= math.hypot(again["ci95"], half)

@@ -4,15 +4,13 @@
 
 A cell is the mean success over a group's seeds ± half the range between the worst and the best of
 them; a group is the runs whose names differ in the seed alone. A test holds that both texts have
-these lines. Needs neither torch nor PyBullet.
+these lines. Needs matplotlib, as figures.py does, which reads the runs.
 """
-import csv
 import glob
 import os
-import re
 
-HERE = os.path.dirname(os.path.abspath(__file__))
-WINDOW = 25                              # updates at the end that "in training" averages
+from figures import RUNS, group_of, read, training_curve
+
 ROWS = {                                 # of README's table -> groups in pushing and lifting
     "**LRN**": ("push-lrn-n2", "lift-lrn-n2"),
     "RN": ("push-rn-n2", "lift-rn-n2"),
@@ -24,45 +22,28 @@ ROWS = {                                 # of README's table -> groups in pushin
 FEW, MANY = (0, 2, 5, 9), (0, 1, 2, 3, 5, 9, 14, 19)           # N in README; in the report
 
 
-def read(run, name):
-    """Rows (dicts of text) of a run's CSV."""
-    with open(os.path.join(run, name), newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def groups():
     """{group: its runs, by seed}."""
     found = {}
-    for run in sorted(glob.glob(os.path.join(HERE, "runs", "*-seed*"))):
-        found.setdefault(re.sub(r"-seed\d+$", "", os.path.basename(run)), []).append(run)
+    for run in sorted(glob.glob(os.path.join(RUNS, "*-seed*"))):
+        found.setdefault(os.path.basename(group_of(run)), []).append(run)
     return found
 
 
 def scores(runs):
     """{N: success of every seed}, for the N that all were played at."""
-    tables = [{int(row["distractors"]): float(row["success"]) for row in read(run, "zeroshot.csv")}
-              for run in runs]
-    return {N: [table[N] for table in tables]
-            for N in tables[0] if all(N in table for table in tables)}
-
-
-def in_training(run):
-    """Success with sampled actions in the last WINDOW updates."""
-    rows = read(run, "progress.csv")
-    last, total, begin = int(rows[-1]["update"]), 0.0, 0
-    for row in rows:                     # a row stands for the updates since the row before
-        end = int(row["update"])
-        total += float(row["success"]) * max(0, end - max(begin, last - WINDOW))
-        begin = end
-    return total / min(WINDOW, last)
+    tables = [read(run, "zeroshot.csv") for run in runs]
+    by_number = [dict(zip(map(int, table["distractors"]), table["success"])) for table in tables]
+    return {N: [seed[N] for seed in by_number]
+            for N in by_number[0] if all(N in seed for seed in by_number)}
 
 
 def cell(values):
     """Mean ± half the range over seeds; nothing where there are none, no range for a single one."""
     if not values:
         return ""
-    mean = f"{sum(values) / len(values):.2f}"
-    return mean + f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else mean
+    mean, half_range = sum(values) / len(values), (max(values) - min(values)) / 2
+    return f"{mean:.2f} ± {half_range:.2f}" if len(values) > 1 else f"{mean:.2f}"
 
 
 def line(*cells):
@@ -87,8 +68,9 @@ def report_table(found):
     yield "|---" * (4 + len(MANY)) + "|"
     for group, runs in found.items():
         by_number = scores(runs)
-        frames = int(read(runs[0], "progress.csv")[-1]["frames"]) / 1e6
-        yield line(group, str(len(runs)), f"{frames:.1f}", cell([*map(in_training, runs)]),
+        frames, ends = zip(*[(x[-1], y[-1])
+                             for x, y in (training_curve(run, "success") for run in runs)])
+        yield line(group, str(len(runs)), f"{max(frames):.1f}", cell(ends),
                    *[cell(by_number.get(N)) for N in MANY])
 
 
