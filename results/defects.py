@@ -244,7 +244,7 @@ DEFECTS = [
     ("evaluate.py", "values.std(ddof=1)", "values.std()", "test_summary_of_four_episodes_by_hand"),
     ("evaluate.py", "(success >= SOLVED).mean()", "(success > SOLVED).mean()",
      "test_summary_of_four_episodes_by_hand"),
-    ("evaluate.py", "range(0, episodes, CHUNK)", "range(0, episodes - CHUNK, CHUNK)",
+    ("evaluate.py", "range(0, len(episodes), CHUNK)", "range(0, len(episodes) - CHUNK, CHUNK)",
      "test_the_table_and_its_csv_are_what_play_says"),
     ("evaluate.py", "numbers = args.distractors or (", "numbers = args.distractors[:1] or (",
      "test_the_table_and_its_csv_are_what_play_says"),
