@@ -1955,6 +1955,17 @@ def test_python_of_readme_runs_as_it_stands(evaluated, capsys):
         capsys.readouterr().out
 
 
+def test_exercises_of_readme_start_where_it_says():
+    starts = ("self.norm(self.f(r.sum(dim=1)))", "places[:, 0]", "r = self.relations(", "terms = {",
+              "HIGHEST_GOAL = 0.2")
+    with open(os.path.join(HERE, "README.md")) as file:
+        places = re.findall(r"\[(\w+\.py):(\d+)\]\(\1#L\2\)", file.read())
+    assert len(places) == len(starts)
+    for (name, number), start in zip(places, starts):
+        with open(os.path.join(HERE, name)) as file:
+            assert start in file.readlines()[int(number) - 1], (name, number)
+
+
 # ---------------------------------------------------------------- results/
 
 @pytest.fixture
