@@ -27,13 +27,14 @@ class LRN(nn.Module):
 
     with_goal       False: no relations, r_i = g_theta(o_i) (ablation of figure 5, purple). As
                     printed, over the K objects: z then knows nothing of the goal
+    goal_token      True, without relations: g_theta(o_goal) joins the sum, so that z can know it
     layer_norm      False: z = f_phi(mean_i r_i), a mean in place of sum and LayerNorm (orange)
     """
 
-    def __init__(self, token_dim=64, z_dim=25, with_goal=True, layer_norm=True):
+    def __init__(self, token_dim=64, z_dim=25, with_goal=True, goal_token=False, layer_norm=True):
         super().__init__()
         D, Z = token_dim, z_dim
-        self.with_goal, self.layer_norm = with_goal, layer_norm
+        self.with_goal, self.goal_token, self.layer_norm = with_goal, goal_token, layer_norm
         self.g = nn.Sequential(
             orthogonal(nn.Linear(2 * D if with_goal else D, D)), nn.ReLU(),
             orthogonal(nn.Linear(D, D)), nn.ReLU(),
@@ -45,6 +46,8 @@ class LRN(nn.Module):
 
     def relations(self, objects, goal):
         """All r_i = g_theta(o_i, o_goal): objects (B, K, D), goal (B, D) -> (B, K, D)."""
+        if self.goal_token:
+            objects = torch.cat([objects, goal[:, None]], dim=1)           # (B, K+1, D)
         if not self.with_goal:
             return self.g(objects)                             # (B, K, D)
         goals = goal[:, None].expand(-1, objects.shape[1], -1)             # (B, K, D), all the same

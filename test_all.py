@@ -118,6 +118,7 @@ def command(*words):
 # ---------------------------------------------------------------- encoders
 
 ENCODERS = {"lrn": LRN, "lrn without goal": lambda: LRN(with_goal=False),
+            "lrn of tokens": lambda: LRN(with_goal=False, goal_token=True),
             "lrn without LayerNorm": lambda: LRN(layer_norm=False), "lrn-max": LRNMax,
             "rn": RN, "attn": ATTN}
 every_encoder = pytest.mark.parametrize("kind", ENCODERS.values(), ids=ENCODERS)
@@ -144,6 +145,7 @@ def shaken(encoder):
 def test_lrn_and_its_ablations_equal_the_loop_over_objects():
     full, alone, largest = map(shaken, (LRN(), LRN(with_goal=False), LRNMax()))
     mean = shaken(LRN(layer_norm=False, z_dim=10))
+    tokens = shaken(LRN(with_goal=False, goal_token=True))
     objects, goal = some(3, 6)
     assert full.relations(objects, goal).shape == (3, 6, D)                # K of them
     assert [type(layer) for layer in full.g] == [nn.Linear, nn.ReLU] * 3 + [nn.Linear]
@@ -151,6 +153,8 @@ def test_lrn_and_its_ablations_equal_the_loop_over_objects():
         pairs = [torch.cat([o, goal[b]]) for o in objects[b]]
         same(full(objects, goal)[b], full.norm(full.f(sum(map(full.g, pairs)))))
         same(alone(objects, goal)[b], alone.norm(alone.f(sum(map(alone.g, objects[b])))))
+        rows = [*objects[b], goal[b]]
+        same(tokens(objects, goal)[b], tokens.norm(tokens.f(sum(map(tokens.g, rows)))))
         same(mean(objects, goal)[b], mean.f(sum(map(mean.g, pairs)) / 6))
         highest = torch.stack([max(column) for column in zip(*map(largest.g, pairs))])
         same(largest(objects, goal)[b], largest.norm(largest.f(highest)))
@@ -218,7 +222,7 @@ def test_wrong_shapes_never_pass_in_silence(kind):
     objects, goal = some(3, 5)
     wrong = [(objects[..., 1:], goal), (objects.repeat(1, 1, 2), goal),
              (objects[..., 1:], goal[:, 1:]), (objects[0], goal[0])]
-    if getattr(encoder, "with_goal", True):                    # else the goal is not looked at
+    if getattr(encoder, "with_goal", True) or encoder.goal_token:                    # else the goal is not looked at
         wrong += [(objects, goal[:, 1:]), (objects, goal.repeat(1, 2)), (objects, goal[:2]),
                   (objects, goal[:, None])]
     for pair in wrong:
@@ -1279,6 +1283,7 @@ def test_settings_reach_the_network():
         assert agent.largest_crowd == 3
     assert agent_of("attn", heads=2).encoder.heads == 2
     assert not agent_of(with_goal=False).encoder.with_goal
+    assert agent_of(with_goal=False, goal_token=True).encoder.goal_token
     assert not agent_of(layer_norm=False).encoder.layer_norm
 
 
@@ -1424,7 +1429,8 @@ def test_paper_sets_the_numbers_of_the_paper_and_of_its_sources():
         "discount": 0.98, "entropy": 0.01, "lr": 0.00025, "value_coef": 0.5, "max_grad_norm": 0.5,
         "minibatches": 40, "lam": 0.95, "clip": 0.5, "epochs": 4, "lr_power": 1, "z_dim": 25,
         "reward_overlap": 100, "reward_distance": 250, "reward_curiosity": 10,
-        "episode_steps": 2500, "with_goal": True, "layer_norm": True,
+        "episode_steps": 2500, "with_goal": True, "goal_token": False,
+        "layer_norm": True,
         "frames": 60_000_000, "envs": 48, "steps": 2500, "substeps": 3, "timestep": 0.004,
         "action_mode": "absolute", "action_scale": 0.1, "motor": "torque", "cube_mass": 0.02,
         "finger_friction": 0.5, "goal_yaw": math.pi / 4, "anneal_clip": True, "adam_eps": 1e-8,

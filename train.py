@@ -89,6 +89,7 @@ NETWORK = {
     "hidden": Setting(128, 128, "width of token MLPs and heads; a guess; CW: 256"),
     "heads": Setting(4, 4, "of ATTN; not printed: a guess"),
     "with_goal": Setting(True, True, "False: LRN without relations (figure 5)"),
+    "goal_token": Setting(False, False, "True: and the goal's token in the sum (not the paper's)"),
     "layer_norm": Setting(True, True, "False: LRN with a mean instead (figure 5)"),
     "log_std": Setting(-0.7, 0.0, "log std of actions at the start; rlpyt: 0; -1 learns later"),
 }
@@ -144,7 +145,7 @@ class ConcatMLP(nn.Sequential):
 # Name -> class and the settings that it takes besides D and Z. To add your own encoder, add a line:
 # any module made by yours(token_dim, z_dim) with forward(objects (B, K, D), goal (B, D)) -> (B, Z).
 ENCODERS = {
-    "lrn": (LRN, ("with_goal", "layer_norm")),
+    "lrn": (LRN, ("with_goal", "goal_token", "layer_norm")),
     "lrn-max": (LRNMax, ()),
     "rn": (RN, ()),
     "attn": (ATTN, ("heads",)),

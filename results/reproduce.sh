@@ -35,6 +35,7 @@ all_runs() {
     group "0"         0-9       ""                     push-{rn,attn}-n{0,1,3}
     group "0"         0-9       "--set frames=9000000" push-mlp-n{0,1,2}
     group "0 1"       0-9       "--set with_goal=False"      push-lrn-n2-norelations  # figure 5
+    group "0 1"       0-9       "--set with_goal=False goal_token=True" push-lrn-n2-tokens
     group "0 1"       0-9       "--set layer_norm=False"     push-lrn-n2-mean
     for z in 10 50 100; do
         group "0 1"   0-9       "--set z_dim=$z"             push-lrn-n2-z$z
