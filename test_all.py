@@ -222,7 +222,8 @@ def test_wrong_shapes_never_pass_in_silence(kind):
     objects, goal = some(3, 5)
     wrong = [(objects[..., 1:], goal), (objects.repeat(1, 1, 2), goal),
              (objects[..., 1:], goal[:, 1:]), (objects[0], goal[0])]
-    if getattr(encoder, "with_goal", True) or encoder.goal_token:                    # else the goal is not looked at
+    looks_at_goal = getattr(encoder, "with_goal", True) or encoder.goal_token
+    if looks_at_goal:
         wrong += [(objects, goal[:, 1:]), (objects, goal.repeat(1, 2)), (objects, goal[:2]),
                   (objects, goal[:, None])]
     for pair in wrong:

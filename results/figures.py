@@ -28,7 +28,8 @@ ENCODERS = {"lrn": ("LRN", "#0072B2"), "rn": ("RN", "#009E73"), "attn": ("ATTN",
             "mlp": ("MLP", "#777777")}   # in all figures: blue, green, red, grey
 LINES = {"RN": "--", "ATTN": "-."}       # for those who see no colours; others are solid
 PAPER = ("lrn", "rn", "attn")            # the paper's encoders
-OTHERS = ("#E69F00", "#AA4499", "black", "#56B4E9", "#8B5A2B", "#999933")     # where an encoder's is taken
+OTHERS = ("#E69F00", "#AA4499", "black", "#56B4E9", "#8B5A2B",     # where an encoder's is taken
+          "#999933")
 KINDS = {"finger 0": "black", "finger 1": "saddlebrown", "finger 2": "red", "target": "green",
          "distractors": "blue"}          # of relations -> colours of the paper's figure 7
 TASKS = {                                # rows of figure 3 -> group of runs
