@@ -7,7 +7,7 @@ linear in K. The sum does not depend on the order of the objects, and any K will
 
 Shapes: objects (B, K, D), goal (B, D) -> z (B, Z).
         B batch, K objects, D token width (the paper's d), Z width of z (its d_z); o_goal: its o_g.
-Run:    python lrn.py        trains at K = 3, tests at K = 1 to 10, without a robot: half a minute
+Run:    python lrn.py        trains at K = 3, tests at K = 1 to 10, without a robot: 20 seconds
 """
 import math
 
@@ -23,20 +23,13 @@ def orthogonal(layer, gain=math.sqrt(2)):
 
 
 class LRN(nn.Module):
-    """Encoder of equation 1. Nothing in it depends on K: one set of weights serves any number.
+    """Encoder of equation 1. Nothing in it depends on K: one set of weights serves any number."""
 
-    with_goal       False: no relations, r_i = g_theta(o_i) (ablation of figure 5, purple). As
-                    printed, over the K objects: z then knows nothing of the goal
-    goal_token      True, without relations: g_theta(o_goal) joins the sum, so that z can know it
-    layer_norm      False: z = f_phi(mean_i r_i), a mean in place of sum and LayerNorm (orange)
-    """
-
-    def __init__(self, token_dim=64, z_dim=25, with_goal=True, goal_token=False, layer_norm=True):
+    def __init__(self, token_dim=64, z_dim=25):
         super().__init__()
         D, Z = token_dim, z_dim
-        self.with_goal, self.goal_token, self.layer_norm = with_goal, goal_token, layer_norm
         self.g = nn.Sequential(
-            orthogonal(nn.Linear(2 * D if with_goal else D, D)), nn.ReLU(),
+            orthogonal(nn.Linear(2 * D, D)), nn.ReLU(),
             orthogonal(nn.Linear(D, D)), nn.ReLU(),
             orthogonal(nn.Linear(D, D)), nn.ReLU(),
             orthogonal(nn.Linear(D, D)),
@@ -46,23 +39,44 @@ class LRN(nn.Module):
 
     def relations(self, objects, goal):
         """All r_i = g_theta(o_i, o_goal): objects (B, K, D), goal (B, D) -> (B, K, D)."""
-        if self.goal_token:
-            objects = torch.cat([objects, goal[:, None]], dim=1)           # (B, K+1, D)
-        if not self.with_goal:
-            return self.g(objects)                             # (B, K, D)
         goals = goal[:, None].expand(-1, objects.shape[1], -1)             # (B, K, D), all the same
         return self.g(torch.cat([objects, goals], dim=2))      # (B, K, 2D) -> (B, K, D)
 
     def forward(self, objects, goal):
         """Equation 1: objects (B, K, D), goal (B, D) -> z (B, Z)."""
         r = self.relations(objects, goal)                      # (B, K, D), g_theta(o_i, o_goal)
-        if not self.layer_norm:
-            return self.f(r.mean(dim=1))                       # (B, Z)
         return self.norm(self.f(r.sum(dim=1)))                 # (B, Z), LayerNorm(f_phi(sum_i r_i))
 
 
+# ---- variants: figure 5's ablations and two of ours
+
+class LRNMean(LRN):
+    """z = f_phi(mean_i r_i): a mean in place of sum and LayerNorm (figure 5, orange)."""
+
+    def forward(self, objects, goal):
+        return self.f(self.relations(objects, goal).mean(dim=1))           # (B, Z)
+
+
+class LRNObjects(LRN):
+    """No relations: r_i = g_theta(o_i) (figure 5, purple). As printed: z never sees the goal."""
+
+    def __init__(self, token_dim=64, z_dim=25):
+        super().__init__(token_dim, z_dim)
+        self.g[0] = orthogonal(nn.Linear(token_dim, token_dim))
+
+    def relations(self, objects, goal):
+        return self.g(objects)                                 # (B, K, D)
+
+
+class LRNTokens(LRNObjects):
+    """Not the paper's: no relations, but g_theta(o_goal) joins the sum, so that z sees the goal."""
+
+    def relations(self, objects, goal):
+        return self.g(torch.cat([objects, goal[:, None]], dim=1))          # (B, K+1, D)
+
+
 class LRNMax(LRN):
-    """Not the paper's: LRN with the largest r_i in each dimension in place of their sum.
+    """Not the paper's: the largest r_i in each dimension in place of their sum.
 
     Ten distractors whose relations are equal then change z exactly as one of them would.
     """
@@ -77,7 +91,7 @@ class LRNMax(LRN):
 def scene(B, K, crowd=None):
     """Objects (B, K, 3): x, y, name. Goal (B, 3): 0, 0, the first one's name. Its place (B, 2).
 
-    crowd=M: the first among M objects, drawn from the other K - 1 with replacement.
+    crowd=M: the first, and M drawn from the other K - 1 with replacement.
     """
     places = 2 * torch.rand(B, K, 2) - 1
     if crowd is not None:
@@ -86,7 +100,8 @@ def scene(B, K, crowd=None):
     shuffled = torch.rand(B, 21).argsort(dim=1)[:, :places.shape[1]]
     names = torch.linspace(-1, 1, 21)[shuffled]                # no two alike in a scene
     objects = torch.cat([places, names[..., None]], dim=2)
-    return objects, objects[:, 0] * torch.tensor([0.0, 0.0, 1.0]), places[:, 0]
+    goal = objects[:, 0] * torch.tensor([0.0, 0.0, 1.0])       # the name alone
+    return objects, goal, places[:, 0]
 
 
 def demo(with_crowds, updates=1000):
@@ -102,6 +117,7 @@ def demo(with_crowds, updates=1000):
         return (read(z) - where).square().mean() / (1 / 3)     # 1/3: variance of a coordinate
 
     for _ in range(updates):
+        # M is uniform here; train.py draws it in two steps, for the sake of RN and ATTN.
         crowd = int(torch.randint(9, ())) if with_crowds and torch.rand(()) < 0.5 else None
         optimizer.zero_grad()
         error(*scene(128, 3, crowd)).backward()

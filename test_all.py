@@ -37,7 +37,7 @@ import lrn
 import train
 import trifinger_env as tri
 from attn import ATTN
-from lrn import LRN, LRNMax
+from lrn import LRN, LRNMax, LRNMean, LRNObjects, LRNTokens
 from ppo import PPO, PointOnLine, TinyAgent, gae, normal_log_prob
 from rn import RN
 from trifinger_env import CUBE, REST, TriFingerEnv
@@ -117,11 +117,7 @@ def command(*words):
 
 # ---------------------------------------------------------------- encoders
 
-ENCODERS = {"lrn": LRN, "lrn without goal": lambda: LRN(with_goal=False),
-            "lrn of tokens": lambda: LRN(with_goal=False, goal_token=True),
-            "lrn without LayerNorm": lambda: LRN(layer_norm=False), "lrn-max": LRNMax,
-            "rn": RN, "attn": ATTN}
-every_encoder = pytest.mark.parametrize("kind", ENCODERS.values(), ids=ENCODERS)
+every_encoder = pytest.mark.parametrize("kind", train.ENCODERS.values(), ids=train.ENCODERS)
 
 
 def some(B, K):
@@ -142,10 +138,9 @@ def shaken(encoder):
     return encoder
 
 
-def test_lrn_and_its_ablations_equal_the_loop_over_objects():
-    full, alone, largest = map(shaken, (LRN(), LRN(with_goal=False), LRNMax()))
-    mean = shaken(LRN(layer_norm=False, z_dim=10))
-    tokens = shaken(LRN(with_goal=False, goal_token=True))
+def test_lrn_and_its_variants_equal_the_loop_over_objects():
+    full, largest, mean = map(shaken, (LRN(), LRNMax(), LRNMean(z_dim=10)))
+    alone, tokens = map(shaken, (LRNObjects(), LRNTokens()))
     objects, goal = some(3, 6)
     assert full.relations(objects, goal).shape == (3, 6, D)                # K of them
     assert [type(layer) for layer in full.g] == [nn.Linear, nn.ReLU] * 3 + [nn.Linear]
@@ -222,8 +217,7 @@ def test_wrong_shapes_never_pass_in_silence(kind):
     objects, goal = some(3, 5)
     wrong = [(objects[..., 1:], goal), (objects.repeat(1, 1, 2), goal),
              (objects[..., 1:], goal[:, 1:]), (objects[0], goal[0])]
-    looks_at_goal = getattr(encoder, "with_goal", True) or encoder.goal_token
-    if looks_at_goal:
+    if kind is not LRNObjects:           # which does not look at the goal
         wrong += [(objects, goal[:, 1:]), (objects, goal.repeat(1, 2)), (objects, goal[:2]),
                   (objects, goal[:, None])]
     for pair in wrong:
@@ -1276,16 +1270,12 @@ def test_mlps_are_orthogonal_and_the_first_policy_is_near_zero():
 
 
 def test_settings_reach_the_network():
-    for name, (kind, _) in train.ENCODERS.items():
+    for name, kind in train.ENCODERS.items():
         agent = agent_of(name, z_dim=10, token_dim=32, hidden=16, crowd=3)
         objects, goal = agent.tokens(observations(2, 3))
         assert type(agent.encoder) is kind and agent.encoder(objects, goal).shape == (2, 10)
         assert objects.shape == (2, 7, 32) and agent.cube[0].out_features == 16
         assert agent.largest_crowd == 3
-    assert agent_of("attn", heads=2).encoder.heads == 2
-    assert not agent_of(with_goal=False).encoder.with_goal
-    assert agent_of(with_goal=False, goal_token=True).encoder.goal_token
-    assert not agent_of(layer_norm=False).encoder.layer_norm
 
 
 def ask(agent, obs, times):
@@ -1430,13 +1420,12 @@ def test_paper_sets_the_numbers_of_the_paper_and_of_its_sources():
         "discount": 0.98, "entropy": 0.01, "lr": 0.00025, "value_coef": 0.5, "max_grad_norm": 0.5,
         "minibatches": 40, "lam": 0.95, "clip": 0.5, "epochs": 4, "lr_power": 1, "z_dim": 25,
         "reward_overlap": 100, "reward_distance": 250, "reward_curiosity": 10,
-        "episode_steps": 2500, "with_goal": True, "goal_token": False,
-        "layer_norm": True,
+        "episode_steps": 2500,
         "frames": 60_000_000, "envs": 48, "steps": 2500, "substeps": 3, "timestep": 0.004,
         "action_mode": "absolute", "action_scale": 0.1, "motor": "torque", "cube_mass": 0.02,
         "finger_friction": 0.5, "goal_yaw": math.pi / 4, "anneal_clip": True, "adam_eps": 1e-8,
         "normalize_advantages": False, "normalize_values": False, "log_std": 0.0,
-        "token_dim": 128, "hidden": 128, "heads": 4, "reward_reach": 0, "auxiliary": 0, "crowd": 0}
+        "token_dim": 128, "hidden": 128, "reward_reach": 0, "auxiliary": 0, "crowd": 0}
     assert settings_of("--paper") == settings_of("--paper --task lift") == expected
     changed = settings_of("--paper --set z_dim=50 anneal_clip=False --set lr=0.1")
     assert changed == {**expected, "z_dim": 50, "anneal_clip": False, "lr": 0.1}
@@ -1454,6 +1443,15 @@ def test_a_new_term_of_the_reward_gets_a_setting_by_itself(monkeypatch):
     assert fresh["SETTINGS"]["reward_mine"][:2] == (7.0, 0.0)  # default, and with --paper
     env = fresh["make_env"]("push", 0, {**fresh["DEFAULTS"], "reward_mine": 8.0})
     assert env.reward_weights["mine"] == 8.0
+
+
+@pytest.mark.parametrize("weights", [{**tri.REWARD_WEIGHTS, "mine": 7.0}, {"overlap": 1.0}])
+def test_a_weight_without_its_formula_or_the_other_way_round_is_an_error(monkeypatch, weights):
+    monkeypatch.setattr(tri, "REWARD_WEIGHTS", weights)
+    env = TriFingerEnv()
+    env.reset(seed=0)
+    with pytest.raises(KeyError):
+        env.step(np.zeros(9))
 
 
 # ---------------------------------------------------------------- training
@@ -1521,9 +1519,9 @@ class DeepSet(nn.Module):
         return self.out(torch.cat([objects.mean(dim=1), goal], dim=1))
 
 
-@pytest.mark.parametrize("encoder", ["lrn-max", "rn", "attn", "mlp", "deepset"])
+@pytest.mark.parametrize("encoder", ["lrn-objects", "rn", "attn", "mlp", "deepset"])
 def test_every_encoder_trains_and_one_of_ones_own_is_one_line(encoder, tmp_path, monkeypatch):
-    monkeypatch.setitem(train.ENCODERS, "deepset", (DeepSet, ()))          # the line
+    monkeypatch.setitem(train.ENCODERS, "deepset", DeepSet)          # the line
     assert command("--encoder", encoder, "--out", tmp_path, *SMALL, "frames=50").end()[0] == 0
     saved, agent = train.load(str(tmp_path))
     untrained = train.make_learner(arguments(encoder=encoder), saved["settings"]).agent
@@ -1680,9 +1678,8 @@ def bad(finished, tmp_path_factory):
 @pytest.mark.parametrize("words", [
     "--encoder gnn", "--task fly", "--seed -1", "--frames 7", "--distractors 21",
     "--distractors two", "--set joy=1", "--set z_dim", "--set z_dim=0", "--set z_dim=2.5",
-    "--set with_goal=maybe", "--set lr=nan", "--set log_std=inf", "--set crowd=21",
+    "--set anneal_clip=maybe", "--set lr=nan", "--set log_std=inf", "--set crowd=21",
     "--set crowd=-1", "--set action_mode=torque", "--set minibatches=7", "--set steps=124",
-    "--set heads=2", "--encoder attn --set heads=7", "--encoder rn --set with_goal=False",
     "--out file", "--out good", "--resume nowhere", "--resume file", "--resume good --seed 3",
     "--resume good --paper", "--resume weights", "--resume code", "--resume swapped",
     "--resume half", "--resume text", "--resume empty"])
@@ -1963,12 +1960,12 @@ def test_python_of_readme_runs_as_it_stands(evaluated, capsys):
 
 
 def test_exercises_of_readme_start_where_it_says():
-    starts = ("self.norm(self.f(r.sum(dim=1)))", "places[:, 0]", "r = self.relations(", "terms = {",
-              "HIGHEST_GOAL = 0.2")
+    starts = ("self.norm(self.f(r.sum(dim=1)))", "goal = objects[:, 0]", "def forward(", "terms = {",
+              "REWARD_WEIGHTS = {", "HIGHEST_GOAL = 0.2")
     with open(os.path.join(HERE, "README.md")) as file:
-        places = re.findall(r"\[(\w+\.py):(\d+)\]\(\1#L\2\)", file.read())
+        places = re.findall(r"\[(?:\w+\.py)?:(\d+)\]\((\w+\.py)#L\1\)", file.read())
     assert len(places) == len(starts)
-    for (name, number), start in zip(places, starts):
+    for (number, name), start in zip(places, starts):
         with open(os.path.join(HERE, name)) as file:
             assert start in file.readlines()[int(number) - 1], (name, number)
 

@@ -28,7 +28,7 @@ import torch.distributed as dist
 from torch import nn
 
 from attn import ATTN
-from lrn import LRN, LRNMax, orthogonal
+from lrn import LRN, LRNMax, LRNMean, LRNObjects, LRNTokens, orthogonal
 from ppo import PPO
 from rn import RN
 from trifinger_env import (CUBE_WIDTH, FINGER_WIDTH, FINGERTIP, GOAL_WIDTH, IDENTIFIER,
@@ -87,10 +87,6 @@ NETWORK = {
     "token_dim": Setting(64, 128, "D; not printed; 64 takes half the time of our guess"),
     "z_dim": Setting(25, 25, "Z (section 5)"),
     "hidden": Setting(128, 128, "width of token MLPs and heads; a guess; CW: 256"),
-    "heads": Setting(4, 4, "of ATTN; not printed: a guess"),
-    "with_goal": Setting(True, True, "False: LRN without relations (figure 5)"),
-    "goal_token": Setting(False, False, "True: and the goal's token in the sum (not the paper's)"),
-    "layer_norm": Setting(True, True, "False: LRN with a mean instead (figure 5)"),
     "log_std": Setting(-0.7, 0.0, "log std of actions at the start; rlpyt: 0; -1 learns later"),
 }
 SETTINGS = {**RUN, **ENV, **REWARD, **LEARNER, **NETWORK}
@@ -142,13 +138,16 @@ class ConcatMLP(nn.Sequential):
         return super().forward(torch.cat([value.flatten(1) for value in obs.values()], dim=1))
 
 
-# Name -> class and the settings that it takes besides D and Z. To add your own encoder, add a line:
-# any module made by yours(token_dim, z_dim) with forward(objects (B, K, D), goal (B, D)) -> (B, Z).
+# To add your own encoder, add a line: any module made by Yours(token_dim, z_dim), with
+# forward(objects (B, K, D), goal (B, D)) -> z (B, Z).
 ENCODERS = {
-    "lrn": (LRN, ("with_goal", "goal_token", "layer_norm")),
-    "lrn-max": (LRNMax, ()),
-    "rn": (RN, ()),
-    "attn": (ATTN, ("heads",)),
+    "lrn": LRN,
+    "rn": RN,
+    "attn": ATTN,
+    "lrn-mean": LRNMean,
+    "lrn-objects": LRNObjects,
+    "lrn-tokens": LRNTokens,
+    "lrn-max": LRNMax,
 }
 
 
@@ -172,8 +171,7 @@ class Agent(nn.Module):
             self.cube = mlp(CUBE_WIDTH, hidden, D)
             self.finger = mlp(FINGER_WIDTH, hidden, D)
             self.goal = mlp(GOAL_WIDTH, hidden, D)
-            make, names = ENCODERS[encoder]
-            self.encoder = make(D, Z, **{name: settings[name] for name in names})
+            self.encoder = ENCODERS[encoder](D, Z)
         self.policy = mlp(Z, hidden, hidden, 9, last_gain=0.01)
         self.value = mlp(Z, hidden, hidden, 1, last_gain=1.0)
         self.read_out = mlp(Z, hidden, FACTS)
@@ -223,10 +221,10 @@ class Agent(nn.Module):
         """The target among M of the scene's other cubes, drawn with replacement, M from 0 to crowd.
 
         cubes (B, N+1, 18), target (B,) -> crowd (B, M+1, 18), the target's index in it (B,).
-        At a fixed N the bias of f_phi can cancel whatever N distractors add to the sum. At a random
-        M it cannot, so a distractor has to add nothing. M is uniform up to a number that is itself
-        uniform: were large crowds as frequent as small ones, RN and ATTN would read nothing for
-        long.
+        At a fixed N a constant, such as the bias of f_phi, can cancel whatever N distractors add to
+        the sum. At a random M it cannot, so a distractor has to add nothing. M is uniform up to a
+        number that is itself uniform: were large crowds as frequent as small ones, RN and ATTN
+        would read nothing for long.
         """
         B, count = cubes.shape[:2]
         most = int(torch.randint(self.largest_crowd + 1, (), generator=self.crowds))
@@ -437,7 +435,7 @@ def read_command(argv=None):
     parser.error = fail
     add = parser.add_argument
     add("--encoder", choices=[*ENCODERS, "mlp"], default="lrn",
-        help="lrn-max is LRN with a maximum in place of the sum (default lrn)")
+        help="those that begin with lrn- are variants, see lrn.py (default lrn)")
     add("--task", choices=("push", "lift"), default="push",
         help="PushingCube or LiftingCube (default push)")
     add("--distractors", type=int, default=2, metavar="N",
@@ -472,9 +470,6 @@ def read_settings(args):
         name, _, text = item.partition("=")
         if name not in SETTINGS:
             fail(f"--set {item}: no such setting; the names are {', '.join(SETTINGS)}")
-        takers = [encoder for encoder, (_, names) in ENCODERS.items() if name in names]
-        if takers and args.encoder not in takers:
-            fail(f"--set {item}: without effect on {args.encoder}, it is a setting of {takers[0]}")
         settings[name] = read_value(item, name, text)
     if settings["crowd"] >= len(POOL):
         fail(f"crowd={settings['crowd']}: there are identifiers for {len(POOL) - 1} distractors")

@@ -643,7 +643,8 @@ class TriFingerEnv(Env):
             "curiosity": far * math.log(moved + 1e-5),
             "reach": before.to_tips - now.to_tips,
         }
-        return {name: weight * terms[name] for name, weight in self.reward_weights.items()}
+        return {name: self.reward_weights[name] * terms[name]  # KeyError: a weight or term lacks
+                for name in self.reward_weights | terms}
 
     def _diverged(self):
         """Last step of an episode whose state is no longer numbers: the next reset builds anew."""

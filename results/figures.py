@@ -42,7 +42,7 @@ TASKS = {                                # rows of figure 3 -> group of runs
 ABLATIONS = {                            # panels of figure 5 -> {group of runs: label}
     "Parts of LRN": {
         "push-lrn-n2": "LRN",
-        "push-lrn-n2-norelations": "without relations",
+        "push-lrn-n2-objects": "without relations",
         "push-lrn-n2-tokens": "the same, with the goal's token",
         "push-lrn-n2-mean": "mean, no LayerNorm",
         "push-lrn-n2-z10": "z of 10 numbers, not 25",

@@ -29,9 +29,9 @@ sys.path.insert(0, os.path.dirname(HERE))
 import evaluate
 from lrn import LRN
 from train import POOL, Agent, fail, load, make_env
-from trifinger_env import CUBE, IDENTIFIER, POSITION, POSITION_SCALE
+from trifinger_env import CUBE, HIGHEST_GOAL, IDENTIFIER, POSITION, POSITION_SCALE
 
-BANDS = ((0, 5), (5, 10), (10, 15), (15, 20))                  # of a lifting goal's height, cm
+BANDS = [(low, low + 5) for low in range(0, round(100 * HIGHEST_GOAL), 5)]   # of heights, cm
 KINDS = ("finger 0", "finger 1", "finger 2", "target")         # of relations, then distractors
 POINTS = 5000                            # most points that t-SNE and distances are given
 
