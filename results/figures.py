@@ -254,9 +254,10 @@ def figure_6():
         points = axes.scatter(numbers(of_it, "x"), numbers(of_it, "y"), s=2, cmap="viridis",
                               c=numbers(of_it, "distractors"), vmin=0, vmax=9)
         axes.set(title=f"z of {label}", xticks=[], yticks=[])
-        moved = [row for row in drifts if row["encoder"] == encoder]
-        panels[1, 1].plot(numbers(moved, "distractors"), numbers(moved, "distance"), "o-",
-                          color=color, label=label)
+        for crowd, line, text in (("", "o-", label), ("-nocrowd", "^:", f"{label}, no crowds")):
+            moved = [row for row in drifts if row["group"] == f"push-{encoder}-n2{crowd}"]
+            panels[1, 1].plot(numbers(moved, "distractors"), numbers(moved, "distance"), line,
+                              color=color, label=text, markersize=4)
     figure.colorbar(points, ax=panels[1, 0], location="bottom", label="N")
     panels[1, 1].axvline(2, color="0.4", linestyle=":")
     panels[1, 1].set(title="energy distance of z at N from z at 2", xlabel="N", ylim=(0, None))

@@ -11,13 +11,14 @@ the target's; for lifting success by the goal's height. All but success are of t
 is made of scenes at the N of training, as Agent.crowd makes it: it judges the transfer without a
 look at a test N.
 --figures plays results/runs/push-{lrn,rn,attn}-n2-seed0 and writes figure6.csv (z at each N in the
-plane), figure6-drift.csv (distance of the z at N from those at 2), figure7.csv (LRN's relations in
-the plane) and figure8.csv (their lengths) in results/; figurerelations.csv is of all seeds of LRN
-with and without crowds. Needs scikit-learn.
+plane), figure6-drift.csv (distance of the z at N from those at 2; also of the runs without crowds),
+figure7.csv (LRN's relations in the plane) and figure8.csv (their lengths) in results/;
+figurerelations.csv is of all seeds of LRN with and without crowds. Needs scikit-learn.
 """
 import argparse
 import csv
 import glob
+import itertools
 import os
 import sys
 
@@ -54,9 +55,10 @@ def starts(checkpoint, N, episodes):
     return batch_of([env.reset(seed=seed)[0] for seed in seeds])
 
 
-def record(encoder, N, episodes, measure):
-    """measure(agent, obs) -> (B, ...) after every step of a shipped run: (steps, episodes, ...)."""
-    checkpoint, agent = load(os.path.join(HERE, "runs", f"push-{encoder}-n2-seed0"))
+def record(group, N, episodes, measure):
+    """measure(agent, obs) -> (B, ...) after every step of a group's seed 0: (steps, episodes, ...).
+    """
+    checkpoint, agent = load(os.path.join(HERE, "runs", f"{group}-seed0"))
     env = make_env("push", N, checkpoint["settings"])
     measured = []
     for episode in range(episodes):
@@ -203,24 +205,26 @@ def embedded(labels, points):
 
 
 def figure_6(episodes, numbers=range(10)):
-    """z by N, encoder by encoder."""
+    """z by N, encoder by encoder, with crowds and without."""
     dots, drifts = [], []
-    for encoder in ("lrn", "rn", "attn"):
-        z = {N: record(encoder, N, episodes, Agent.encode) for N in numbers}
+    for encoder, crowd in itertools.product(("lrn", "rn", "attn"), ("", "-nocrowd")):
+        group = f"push-{encoder}-n2{crowd}"
+        z = {N: record(group, N, episodes, Agent.encode) for N in numbers}
         clouds = {N: some(z[N].reshape(-1, z[N].shape[-1]), POINTS) for N in numbers}
-        drifts += [(encoder, N, energy_distance(clouds[N], clouds[2])) for N in numbers]
-        samples = {N: some(moments(z[N]), POINTS // len(numbers)) for N in numbers}
-        labels = [(encoder, N) for N in numbers for _ in samples[N]]
-        dots += embedded(labels, np.concatenate(list(samples.values())))
+        drifts += [(group, N, energy_distance(clouds[N], clouds[2])) for N in numbers]
+        if not crowd:
+            samples = {N: some(moments(z[N]), POINTS // len(numbers)) for N in numbers}
+            labels = [(encoder, N) for N in numbers for _ in samples[N]]
+            dots += embedded(labels, np.concatenate(list(samples.values())))
     write("figure6.csv", ("encoder", "distractors", "x", "y"), dots)
-    write("figure6-drift.csv", ("encoder", "distractors", "distance"), drifts)
+    write("figure6-drift.csv", ("group", "distractors", "distance"), drifts)
 
 
 def figure_7(episodes, numbers=range(3, 7)):
     """LRN's relations by kind, in the plane."""
     points, labels = [], []
     for N in numbers:
-        r = moments(record("lrn", N, episodes, relations_of))  # (n, K, D)
+        r = moments(record("push-lrn-n2", N, episodes, relations_of))      # (n, K, D)
         r = some(r, POINTS // (len(numbers) * r.shape[1]))     # as many points at every N, about
         points += list(r.reshape(-1, r.shape[-1]))
         labels += [(kind,) for kind in (*KINDS, *["distractors"] * N)] * len(r)
@@ -231,7 +235,7 @@ def figure_8(episodes):
     """Lengths of LRN's relations by kind over an episode; of distractors, their mean."""
     rows = []
     for N in (4, 5):
-        r = record("lrn", N, episodes, relations_of)           # (steps, E, K, D)
+        r = record("push-lrn-n2", N, episodes, relations_of)           # (steps, E, K, D)
         lengths = np.linalg.norm(r, axis=-1).mean(axis=1)      # (steps, K)
         for step, row in enumerate(lengths.tolist(), 1):
             rows.append((N, step, *row[:4], sum(row[4:]) / N))
