@@ -7,9 +7,10 @@ them; a group is the runs whose names differ in the seed alone. A test holds tha
 these lines. Needs matplotlib, as figures.py does, which reads the runs.
 """
 import glob
+import itertools
 import os
 
-from figures import RUNS, group_of, read, training_curve
+from figures import ABLATIONS, PAPER, RUNS, frames_to, group_of, read, training_curve
 
 ROWS = {                                 # of README's table -> groups in pushing and lifting
     "**LRN**": ("push-lrn-n2", "lift-lrn-n2"),
@@ -20,6 +21,25 @@ ROWS = {                                 # of README's table -> groups in pushin
     "ATTN without crowds": ("push-attn-n2-nocrowd", "lift-attn-n2-nocrowd"),
 }
 FEW, MANY = (0, 2, 5, 9), (0, 1, 2, 3, 5, 9, 14, 19)           # N in README; in the report
+# Rows of the report's first table: claim, what is measured for each encoder, verdict. "GROUP N" is
+# the score at N, "GROUP 0.5 M" the million frames until success in training is 0.5.
+CLAIMS = (
+    ("LRN and RN learn pushing almost perfectly (figure 3): at 2", "push-{}-n2 2", ""),
+    ("and lifting: at 2", "lift-{}-n2 2", ""),
+    ("ATTN learns later (3): million frames to 0.5", "push-{}-n2 0.5 M", ""),
+    ("LRN and RN keep their score, ATTN does not (3): pushing at 9", "push-{}-n2 9", ""),
+    ("the same without crowds", "push-{}-n2-nocrowd 9", ""),
+    ("lifting at 9", "lift-{}-n2 9", ""),
+    ("the same without crowds", "lift-{}-n2-nocrowd 9", ""),
+    ("LRN and RN work with fewer objects (3): pushing at 0", "push-{}-n2 0", ""),
+    ("ATTN needs \"exactly two distractors\" (4.3): pushing at 1", "push-{}-n2 1", ""),
+    ("the same without crowds", "push-{}-n2-nocrowd 1", ""),
+    ("the transfer may hold beyond 9 (4.3): pushing at 19", "push-{}-n2 19", ""),
+    ("LRN alone transfers from training at 1 (4): at 9", "push-{}-n1 9", ""),
+    ("LRN and RN transfer from training at 3 (4): at 9", "push-{}-n3 9", ""),
+    ("in the paper's world, with its reward: at 2", "push-{}-n2-paperworld 2", ""),
+    ("at 9", "push-{}-n2-paperworld 9", ""),
+)
 
 
 def groups():
@@ -74,6 +94,38 @@ def report_table(found):
                    *[cell(by_number.get(N)) for N in MANY])
 
 
+def measured(found, what):
+    """The cell of a group's score, "GROUP N", or of its frames, "GROUP 0.5 M"."""
+    group, number, *in_frames = what.split()
+    runs = found.get(group, [])
+    if not in_frames:
+        return cell(scores(runs).get(int(number))) if runs else ""
+    reached = [frames_to(run, float(number)) for run in runs]
+    if not all(is_reached for _, is_reached in reached):
+        return "never" if len(reached) == 1 else "not in all"
+    return cell([frames for frames, _ in reached])
+
+
+def claims_table(found):
+    """Lines of the report's first table: claims, what came out here, verdicts."""
+    yield line("the paper says", "LRN", "RN", "ATTN", "verdict")
+    yield "|---" * 5 + "|"
+    for claim, what, verdict in CLAIMS:
+        cells = [measured(found, what.format(encoder)) for encoder in PAPER]
+        if any(cells):
+            yield line(claim, *cells, verdict)
+
+
+def variants_table(found):
+    """Lines of the table beside figure 5: variants of LRN and of the reward."""
+    yield line("LRN in pushing", "seeds", "at 2", "at 9")
+    yield "|---" * 4 + "|"
+    for group, label in itertools.chain(*[lines.items() for lines in ABLATIONS.values()]):
+        if group in found:
+            cells = [measured(found, f"{group} {N}") for N in (2, 9)]
+            yield line(label, str(len(found[group])), *cells)
+
+
 if __name__ == "__main__":
-    for table in (readme_table, report_table):
+    for table in (readme_table, claims_table, variants_table, report_table):
         print("\n".join(table(groups())), end="\n\n")
