@@ -29,7 +29,7 @@ ENCODERS = {"lrn": ("LRN", "#0072B2"), "rn": ("RN", "#009E73"), "attn": ("ATTN",
 LINES = {"RN": "--", "ATTN": "-."}       # for those who see no colours; others are solid
 PAPER = ("lrn", "rn", "attn")            # the paper's encoders
 OTHERS = ("#E69F00", "#AA4499", "black", "#56B4E9", "#8B5A2B",     # where an encoder's is taken
-          "#999933")
+          "#999933", "#332288")
 KINDS = {"finger 0": "black", "finger 1": "saddlebrown", "finger 2": "red", "target": "green",
          "distractors": "blue"}          # of relations -> colours of the paper's figure 7
 TASKS = {                                # rows of figure 3 -> group of runs
@@ -45,6 +45,7 @@ ABLATIONS = {                            # panels of figure 5 -> {group of runs:
         "push-lrn-n2-objects": "without relations",
         "push-lrn-n2-tokens": "the same, with the goal's token",
         "push-lrn-n2-mean": "mean, no LayerNorm",
+        "push-lrn-n2-max": "maximum, not sum (ours)",
         "push-lrn-n2-z10": "z of 10 numbers, not 25",
         "push-lrn-n2-z50": "z of 50",
         "push-lrn-n2-z100": "z of 100",
