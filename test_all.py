@@ -1999,6 +1999,20 @@ def test_inside_looks_into_a_run(evaluated, results_script, capsys):
     assert inside.is_blocked({"cubes": cubes, "goal": goal}).tolist() == [True, False]
 
 
+def test_tables_of_readme_and_report_are_those_of_the_runs(monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.syspath_prepend(os.path.join(HERE, "results"))
+    import tables
+    found = tables.groups()
+    assert found
+    for name, table in (("README.md", tables.readme_table),
+                        ("results/README.md", tables.report_table)):
+        with open(os.path.join(HERE, name)) as file:
+            lines = file.read().splitlines()
+        for line in table(found):
+            assert line in lines, name
+
+
 def test_figures_draws_the_curves_of_any_run(evaluated, results_script, tmp_path):
     pytest.importorskip("matplotlib").use("Agg")
     results_script("figures", evaluated[0])

@@ -7,19 +7,12 @@ them; a group is the runs whose names differ in the seed alone. A test holds tha
 these lines. Needs matplotlib, as figures.py does, which reads the runs.
 """
 import glob
-import itertools
 import os
 
 from figures import ABLATIONS, PAPER, RUNS, frames_to, group_of, read, training_curve
 
-ROWS = {                                 # of README's table -> groups in pushing and lifting
-    "**LRN**": ("push-lrn-n2", "lift-lrn-n2"),
-    "RN": ("push-rn-n2", "lift-rn-n2"),
-    "ATTN": ("push-attn-n2", "lift-attn-n2"),
-    "LRN without crowds": ("push-lrn-n2-nocrowd", "lift-lrn-n2-nocrowd"),
-    "RN without crowds": ("push-rn-n2-nocrowd", "lift-rn-n2-nocrowd"),
-    "ATTN without crowds": ("push-attn-n2-nocrowd", "lift-attn-n2-nocrowd"),
-}
+ROWS = {"**LRN**": "{}-lrn-n2", "RN": "{}-rn-n2", "ATTN": "{}-attn-n2",       # of README's table
+        "LRN without crowds": "{}-lrn-n2-nocrowd"}
 FEW, MANY = (0, 2, 5, 9), (0, 1, 2, 3, 5, 9, 14, 19)           # N in README; in the report
 # Rows of the report's first table: claim, what is measured for each encoder, verdict. "GROUP N" is
 # the score at N, "GROUP 0.5 M" the million frames until success in training is 0.5.
@@ -71,15 +64,14 @@ def line(*cells):
 
 
 def readme_table(found):
-    """Lines of README's table: rows by encoder, pushing and lifting side by side."""
-    numbers = [str(N) for N in FEW]
-    yield line("success at N =", *numbers, "lifting:", *numbers)
-    yield "|---" * (2 * len(FEW) + 2) + "|"
-    for label, (push, lift) in ROWS.items():
-        if push in found:
-            pushed, lifted = (scores(found[g]) if g in found else {} for g in (push, lift))
-            yield line(label, *[cell(pushed.get(N)) for N in FEW], "",
-                       *[cell(lifted.get(N)) for N in FEW])
+    """Lines of README's table: rows by encoder; pushing, then lifting."""
+    yield line("success at N =", *map(str, FEW))
+    yield "|---" * (len(FEW) + 1) + "|"
+    for task in ("push", "lift"):
+        for label, name in ROWS.items():
+            if name.format(task) in found:
+                yield line(f"{task}ing: {label}", *[measured(found, f"{name.format(task)} {N}")
+                                                    for N in FEW])
 
 
 def report_table(found):
@@ -120,7 +112,8 @@ def variants_table(found):
     """Lines of the table beside figure 5: variants of LRN and of the reward."""
     yield line("LRN in pushing", "seeds", "at 2", "at 9")
     yield "|---" * 4 + "|"
-    for group, label in itertools.chain(*[lines.items() for lines in ABLATIONS.values()]):
+    parts, terms = ABLATIONS.values()
+    for group, label in (terms | parts).items():               # the default is in both: once
         if group in found:
             cells = [measured(found, f"{group} {N}") for N in (2, 9)]
             yield line(label, str(len(found[group])), *cells)
