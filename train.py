@@ -192,7 +192,7 @@ class Agent(nn.Module):
         return self.policy(z), self.log_std, self.value(z).squeeze(-1)
 
     def auxiliary(self, obs):
-        """Read-out loss (ours): how well z tells what the task is about, in scaled units.
+        """Read-out loss (ours): how well z encodes what the task is about, in scaled units.
 
         A small head reads FACTS numbers from z: the target cube's position and velocity, the goal's
         position and the three fingertips; the loss is their mean squared error. A batch holds few
@@ -204,7 +204,8 @@ class Agent(nn.Module):
         cubes = obs["cubes"]
         B, count = cubes.shape[:2]
         rows, target = torch.arange(B), torch.randint(count, (B,))
-        if self.largest_crowd and not self.is_mlp and torch.rand((), generator=self.crowds) < 0.5:
+        can_crowd = self.largest_crowd and count > 1 and not self.is_mlp
+        if can_crowd and torch.rand((), generator=self.crowds) < 0.5:
             cubes, target = self.crowd(cubes, target)          # (B, M+1, 18)
         shuffled = torch.rand(B, len(POOL)).argsort(dim=1)[:, :cubes.shape[1]]
         identifiers = POOL[shuffled]                           # (B, M+1), distinct in a row
@@ -218,19 +219,16 @@ class Agent(nn.Module):
         return (self.read_out(z) - facts).square().mean()
 
     def crowd(self, cubes, target):
-        """The target among M of the scene's other cubes, drawn with replacement, M from 0 to crowd.
+        """The target among M of the scene's other cubes, drawn with replacement.
 
         cubes (B, N+1, 18), target (B,) -> crowd (B, M+1, 18), the target's index in it (B,).
         At a fixed N a constant, such as the bias of f_phi, can cancel whatever N distractors add to
         the sum. At a random M it cannot, so a distractor has to add nothing. M is uniform up to a
-        number that is itself uniform: were large crowds as frequent as small ones, RN and ATTN
-        would read nothing for long.
+        number that is itself uniform: mostly small, so that RN learns to read soon, at times large.
         """
         B, count = cubes.shape[:2]
         most = int(torch.randint(self.largest_crowd + 1, (), generator=self.crowds))
         M = int(torch.randint(most + 1, (), generator=self.crowds))
-        if count == 1:                                         # no distractor to make a crowd of
-            return cubes, target
         rows, column = torch.arange(B), torch.randint(M + 1, (B,))
         chosen = (target[:, None] + torch.randint(1, count, (B, M + 1))) % count   # never target
         chosen[rows, column] = target

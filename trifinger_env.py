@@ -643,7 +643,7 @@ class TriFingerEnv(Env):
             "curiosity": far * math.log(moved + 1e-5),
             "reach": before.to_tips - now.to_tips,
         }
-        return {name: self.reward_weights[name] * terms[name]  # KeyError: a weight or term lacks
+        return {name: self.reward_weights[name] * terms[name]  # KeyError: no weight, or no formula
                 for name in self.reward_weights | terms}
 
     def _diverged(self):

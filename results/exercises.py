@@ -1,6 +1,6 @@
 """Answers to two of README's exercises: more relations, and recurrence.
 
-    python results/exercises.py                 three minutes of one core: a table
+    python results/exercises.py                 three minutes of one core: a table, exercises.csv
 
 The question: how many other objects lie within 0.7 of the named one, among K = 5? A relation
 g(o_i, o_goal) sees one object at a time; how they lie to each other is left to the MLP that reads
@@ -12,7 +12,8 @@ import sys
 import torch
 from torch import nn
 
-sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+HERE = os.path.dirname(os.path.abspath(__file__))
+sys.path.insert(0, os.path.dirname(HERE))
 import lrn
 from rn import RN
 
@@ -27,10 +28,10 @@ class Triples(lrn.LRN):
         self.g[0] = lrn.orthogonal(nn.Linear(3 * token_dim, token_dim))
 
     def relations(self, objects, goal):
-        B, K, D = objects.shape
-        first = objects[:, :, None].expand(B, K, K, D)
-        second = objects[:, None].expand(B, K, K, D)
-        goals = goal[:, None, None].expand(B, K, K, D)
+        count = objects.shape[1]                               # K
+        first = objects[:, :, None].expand(-1, -1, count, -1)              # (B, K, K, D)
+        second = objects[:, None].expand(-1, count, -1, -1)
+        goals = goal[:, None, None].expand_as(first)
         return self.g(torch.cat([first, second, goals], dim=3)).flatten(1, 2)      # (B, K^2, D)
 
 
@@ -75,6 +76,10 @@ def error_of(encoder):
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    for encoder in (lrn.LRN, RN, Triples, TwoRounds):
-        torch.manual_seed(0)
-        print(f"{encoder.__name__:10s} {error_of(encoder()):.2f}", flush=True)
+    with open(os.path.join(HERE, "exercises.csv"), "w") as file:
+        print("encoder,error", file=file)
+        for encoder in (lrn.LRN, RN, Triples, TwoRounds):
+            torch.manual_seed(0)
+            error = error_of(encoder())
+            print(f"{encoder.__name__:10s} {error:.2f}", flush=True)
+            print(f"{encoder.__name__},{error:.3f}", file=file)

@@ -294,7 +294,7 @@ def figure_8():
 
 
 def figure_readout():
-    """Not in the paper: how soon z tells where the named cube is, with and without crowds."""
+    """Not in the paper: how soon z encodes where the named cube is, with and without crowds."""
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained", sharey=True)
     for (title, name), axes in zip(TASKS.items(), panels):     # the first two: PushingCube
         for encoder in PAPER:

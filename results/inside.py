@@ -28,7 +28,6 @@ import torch
 HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path.insert(0, os.path.dirname(HERE))
 import evaluate
-from lrn import LRN
 from train import POOL, Agent, fail, load, make_env
 from trifinger_env import CUBE, HIGHEST_GOAL, IDENTIFIER, POSITION, POSITION_SCALE
 
@@ -56,8 +55,7 @@ def starts(checkpoint, N, episodes):
 
 
 def record(group, N, episodes, measure):
-    """measure(agent, obs) -> (B, ...) after every step of a group's seed 0: (steps, episodes, ...).
-    """
+    """measure(agent, obs) after every step of a group's seed 0: (steps, episodes, ...)."""
     checkpoint, agent = load(os.path.join(HERE, "runs", f"{group}-seed0"))
     env = make_env("push", N, checkpoint["settings"])
     measured = []
@@ -129,7 +127,7 @@ def by_number(checkpoint, agent, N, episodes):
         "read error, mm": read_error(agent, obs),
         "drift of z": drift_of(agent.encode(obs), agent.encode(trained)),
     }
-    if isinstance(agent.encoder, LRN):
+    if checkpoint["encoder"] == "lrn":
         row["relations"] = distractors_share(agent, obs)
     if checkpoint["task"] == "lift":
         height = 100 * POSITION_SCALE * obs["goal"][:, POSITION][:, 2]     # cm
@@ -190,7 +188,7 @@ def moments(steps):
 
 
 def write(name, columns, rows):
-    """A CSV in results/; floats with three decimals."""
+    """A CSV in results/; floats with four decimals."""
     texts = [[f"{cell:.4f}" if isinstance(cell, float) else cell for cell in row] for row in rows]
     with open(os.path.join(HERE, name), "w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([columns, *texts])

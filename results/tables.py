@@ -4,7 +4,8 @@
 
 A cell is the mean success over a group's seeds ± half the range between the worst and the best of
 them; a group is the runs whose names differ in the seed alone. A test holds that both texts have
-these lines. Needs matplotlib, as figures.py does, which reads the runs.
+the lines of README's table and of the table of runs. Needs matplotlib, as figures.py does, which
+reads the runs.
 """
 import glob
 import os
@@ -14,24 +15,24 @@ from figures import ABLATIONS, PAPER, RUNS, frames_to, group_of, read, training_
 ROWS = {"**LRN**": "{}-lrn-n2", "RN": "{}-rn-n2", "ATTN": "{}-attn-n2",       # of README's table
         "LRN without crowds": "{}-lrn-n2-nocrowd"}
 FEW, MANY = (0, 2, 5, 9), (0, 1, 2, 3, 5, 9, 14, 19)           # N in README; in the report
-# Rows of the report's first table: claim, what is measured for each encoder, verdict. "GROUP N" is
-# the score at N, "GROUP 0.5 M" the million frames until success in training is 0.5.
+# Rows of the table of claims: the claim, the groups that it is measured in, and the N of the score,
+# or None for the million frames until success in training is 0.5.
 CLAIMS = (
-    ("LRN and RN learn pushing almost perfectly (figure 3): at 2", "push-{}-n2 2", ""),
-    ("and lifting: at 2", "lift-{}-n2 2", ""),
-    ("ATTN learns later (3): million frames to 0.5", "push-{}-n2 0.5 M", ""),
-    ("LRN and RN keep their score, ATTN does not (3): pushing at 9", "push-{}-n2 9", ""),
-    ("the same without crowds", "push-{}-n2-nocrowd 9", ""),
-    ("lifting at 9", "lift-{}-n2 9", ""),
-    ("the same without crowds", "lift-{}-n2-nocrowd 9", ""),
-    ("LRN and RN work with fewer objects (3): pushing at 0", "push-{}-n2 0", ""),
-    ("ATTN needs \"exactly two distractors\" (4.3): pushing at 1", "push-{}-n2 1", ""),
-    ("the same without crowds", "push-{}-n2-nocrowd 1", ""),
-    ("the transfer may hold beyond 9 (4.3): pushing at 19", "push-{}-n2 19", ""),
-    ("LRN alone transfers from training at 1 (4): at 9", "push-{}-n1 9", ""),
-    ("LRN and RN transfer from training at 3 (4): at 9", "push-{}-n3 9", ""),
-    ("in the paper's world, with its reward: at 2", "push-{}-n2-paperworld 2", ""),
-    ("at 9", "push-{}-n2-paperworld 9", ""),
+    ("LRN and RN learn pushing almost perfectly (figure 3): at 2", "push-{}-n2", 2),
+    ("and lifting: at 2", "lift-{}-n2", 2),
+    ("ATTN learns later (3): million frames to 0.5", "push-{}-n2", None),
+    ("LRN and RN keep their score, ATTN does not (3): pushing at 9", "push-{}-n2", 9),
+    ("the same without crowds", "push-{}-n2-nocrowd", 9),
+    ("lifting at 9", "lift-{}-n2", 9),
+    ("the same without crowds", "lift-{}-n2-nocrowd", 9),
+    ("LRN and RN work with fewer objects (3): pushing at 0", "push-{}-n2", 0),
+    ("ATTN needs \"exactly two distractors\" (4.3): pushing at 1", "push-{}-n2", 1),
+    ("the same without crowds", "push-{}-n2-nocrowd", 1),
+    ("the transfer may hold beyond 9 (4.3): pushing at 19", "push-{}-n2", 19),
+    ("LRN alone transfers from training at 1 (4): at 9", "push-{}-n1", 9),
+    ("LRN and RN transfer from training at 3 (4): at 9", "push-{}-n3", 9),
+    ("in the paper's world, with its reward: at 2", "push-{}-n2-paperworld", 2),
+    ("at 9", "push-{}-n2-paperworld", 9),
 )
 
 
@@ -56,7 +57,7 @@ def cell(values):
     if not values:
         return ""
     mean, half_range = sum(values) / len(values), (max(values) - min(values)) / 2
-    return f"{mean:.2f} ± {half_range:.2f}" if len(values) > 1 else f"{mean:.2f}"
+    return f"{mean:.2f}±{half_range:.2f}" if len(values) > 1 else f"{mean:.2f}"
 
 
 def line(*cells):
@@ -67,10 +68,10 @@ def readme_table(found):
     """Lines of README's table: rows by encoder; pushing, then lifting if there are runs of it."""
     tasks = [task for task in ("push", "lift") if f"{task}-lrn-n2" in found]
     columns = [(task, N) for task in tasks for N in FEW]
-    yield line("success", *[f"{task}ing, N = {N}" for task, N in columns])
+    yield line("N", *[f"{task} {N}" if N == FEW[0] else str(N) for task, N in columns])
     yield "|---" * (len(columns) + 1) + "|"
     for label, name in ROWS.items():
-        cells = [measured(found, f"{name.format(task)} {N}") for task, N in columns]
+        cells = [measured(found, name.format(task), N) for task, N in columns]
         if any(cells):
             yield line(label, *cells)
 
@@ -87,26 +88,23 @@ def report_table(found):
                    *[cell(by_number.get(N)) for N in MANY])
 
 
-def measured(found, what):
-    """The cell of a group's score, "GROUP N", or of its frames, "GROUP 0.5 M"."""
-    group, number, *in_frames = what.split()
+def measured(found, group, N):
+    """The cell of a group's score at N, or with None of its million frames to 0.5 in training."""
     runs = found.get(group, [])
-    if not in_frames:
-        return cell(scores(runs).get(int(number))) if runs else ""
-    reached = [frames_to(run, float(number)) for run in runs]
-    if not all(is_reached for _, is_reached in reached):
-        return "never" if len(reached) == 1 else "not in all"
-    return cell([frames for frames, _ in reached])
+    if N is not None:
+        return cell(scores(runs).get(N)) if runs else ""
+    frames, is_reached = zip(*[frames_to(run, 0.5) for run in runs]) if runs else ((), ())
+    return cell(frames) if all(is_reached) else "not in all"
 
 
 def claims_table(found):
-    """Lines of the report's first table: claims, what came out here, verdicts."""
-    yield line("the paper says", "LRN", "RN", "ATTN", "verdict")
-    yield "|---" * 5 + "|"
-    for claim, what, verdict in CLAIMS:
-        cells = [measured(found, what.format(encoder)) for encoder in PAPER]
+    """Lines of the table of claims, whose verdicts are for a reader to give."""
+    yield line("the paper says", "LRN", "RN", "ATTN")
+    yield "|---" * 4 + "|"
+    for claim, group, N in CLAIMS:
+        cells = [measured(found, group.format(encoder), N) for encoder in PAPER]
         if any(cells):
-            yield line(claim, *cells, verdict)
+            yield line(claim, *cells)
 
 
 def variants_table(found):
@@ -116,10 +114,11 @@ def variants_table(found):
     parts, terms = ABLATIONS.values()
     for group, label in (terms | parts).items():               # the default is in both: once
         if group in found:
-            cells = [measured(found, f"{group} {N}") for N in (2, 9)]
+            cells = [measured(found, group, N) for N in (2, 9)]
             yield line(label, str(len(found[group])), *cells)
 
 
 if __name__ == "__main__":
+    runs_by_group = groups()
     for table in (readme_table, claims_table, variants_table, report_table):
-        print("\n".join(table(groups())), end="\n\n")
+        print("\n".join(table(runs_by_group)), end="\n\n")
