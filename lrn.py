@@ -104,25 +104,32 @@ def scene(B, K, crowd=None):
     return objects, goal, places[:, 0]
 
 
+def learn(error, modules, updates):
+    """Adam on error(), that of a fresh batch each time, with a linearly falling learning rate."""
+    optimizer = torch.optim.Adam(nn.ModuleList(modules).parameters(), lr=2e-3)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, updates)
+    for _ in range(updates):
+        optimizer.zero_grad()
+        error().backward()
+        optimizer.step()
+        schedule.step()
+
+
 def demo(with_crowds, updates=1000):
     """Learn at K = 3 where the named object is. {K: RMS error}; always guessing 0 would have 1."""
     torch.manual_seed(0)
     token, encoder, read = nn.Linear(3, 64), LRN(), nn.Linear(25, 2)
-    parameters = nn.ModuleList([token, encoder, read]).parameters()
-    optimizer = torch.optim.Adam(parameters, lr=2e-3)
-    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, updates)
 
     def error(objects, goal, where):
         z = encoder(token(objects), token(goal))
         return (read(z) - where).square().mean() / (1 / 3)     # 1/3: variance of a coordinate
 
-    for _ in range(updates):
-        # M is uniform here; train.py draws it in two steps, for the sake of RN and ATTN.
+    def batch_error():
+        # M is uniform here; train.py draws it in two steps, so that RN learns to read soon.
         crowd = int(torch.randint(9, ())) if with_crowds and torch.rand(()) < 0.5 else None
-        optimizer.zero_grad()
-        error(*scene(128, 3, crowd)).backward()
-        optimizer.step()
-        schedule.step()
+        return error(*scene(128, 3, crowd))
+
+    learn(batch_error, [token, encoder, read], updates)
     with torch.no_grad():
         return {K: error(*scene(2000, K)).sqrt().item() for K in (1, 3, 5, 10)}
 

@@ -1960,8 +1960,8 @@ def test_python_of_readme_runs_as_it_stands(evaluated, capsys):
 
 
 def test_exercises_of_readme_start_where_it_says():
-    starts = ("self.norm(self.f(r.sum(dim=1)))", "goal = objects[:, 0]", "def forward(", "terms = {",
-              "REWARD_WEIGHTS = {", "HIGHEST_GOAL = 0.2")
+    starts = ("self.norm(self.f(r.sum(dim=1)))", "goal = objects[:, 0]", "def forward(",
+              "terms = {", "REWARD_WEIGHTS = {", "HIGHEST_GOAL = 0.2")
     with open(os.path.join(HERE, "README.md")) as file:
         text = file.read().replace("(weight: line ", "\n0. trifinger_env.py:")
     places = re.findall(r"^\d\. (\w+\.py):(\d+)", text, re.MULTILINE)

@@ -59,17 +59,11 @@ def error_of(encoder):
     token = nn.Linear(3, 64)
     read = nn.Sequential(nn.Linear(25, 128), nn.ReLU(), nn.Linear(128, 1))
     deviation = scene(20_000)[2].std()
-    optimizer = torch.optim.Adam(nn.ModuleList([token, encoder, read]).parameters(), lr=2e-3)
-    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, UPDATES)
 
     def loss(objects, goal, near):
         return ((read(encoder(token(objects), token(goal))) - near) / deviation).square().mean()
 
-    for _ in range(UPDATES):
-        optimizer.zero_grad()
-        loss(*scene(128)).backward()
-        optimizer.step()
-        schedule.step()
+    lrn.learn(lambda: loss(*scene(128)), [token, encoder, read], UPDATES)
     with torch.no_grad():
         return loss(*scene(4000)).sqrt().item()
 

@@ -233,7 +233,7 @@ def figure_8(episodes):
     """Lengths of LRN's relations by kind over an episode; of distractors, their mean."""
     rows = []
     for N in (4, 5):
-        r = record("push-lrn-n2", N, episodes, relations_of)           # (steps, E, K, D)
+        r = record("push-lrn-n2", N, episodes, relations_of)   # (steps, E, K, D)
         lengths = np.linalg.norm(r, axis=-1).mean(axis=1)      # (steps, K)
         for step, row in enumerate(lengths.tolist(), 1):
             rows.append((N, step, *row[:4], sum(row[4:]) / N))

@@ -34,8 +34,8 @@ all_runs() {
     group "0 1"       0-9       ""                     push-lrn-n{0,1,3}           # figures 1, 4
     group "0"         0-9       ""                     push-{rn,attn}-n{0,1,3}
     group "0"         0-9       "--set frames=9000000" push-mlp-n{0,1,2}
-    for variant in objects tokens mean max; do                                       # figure 5
-        group "0 1"   0-9       "--encoder lrn-$variant"     push-lrn-n2-$variant      # the last one counts
+    for variant in objects tokens mean max; do                 # figure 5; the last --encoder counts
+        group "0 1"   0-9       "--encoder lrn-$variant"     push-lrn-n2-$variant
     done
     for z in 10 50 100; do
         group "0 1"   0-9       "--set z_dim=$z"             push-lrn-n2-z$z
