@@ -2,7 +2,6 @@
 
     python evaluate.py RUN                                   N = 0..9, 200 episodes each: a table
     python evaluate.py RUN [RUN ...] --distractors 0-9,14 --save       and RUN/zeroshot.csv
-    python evaluate.py RUN --sample-actions                  with the noise of training
     python evaluate.py RUN --watch                           watch it play, live in a window
     python evaluate.py RUN RUN --gif push.gif --distractors 9          a film, side by side
 
@@ -38,7 +37,6 @@ COLUMNS = ("distractors", "episodes", "success", "ci95", "success_strict", "ci95
            "cut_short")
 CHUNK = 25                               # episodes side by side; another number may change bits
 EVALUATION = 20220131                    # as a run's seed: keeps episodes apart from training's
-STARTS, NOISE = 0, 1                     # what an episode draws: see derived_seed()
 PICTURE_PERIOD = 0.08                    # s between two pictures of a film, about
 PICTURE = 400, 300                       # width and height of one
 
@@ -47,12 +45,7 @@ PICTURE = 400, 300                       # width and height of one
 
 def episode_seed(episode):
     """Seed of evaluation episode `episode`."""
-    return derived_seed(EVALUATION, episode, STARTS)
-
-
-def noise_of(episodes):
-    """One generator of action noise per episode, independent of the one that places the cubes."""
-    return [np.random.default_rng(derived_seed(EVALUATION, episode, NOISE)) for episode in episodes]
+    return derived_seed(EVALUATION, episode, 0)
 
 
 def as_batch(observations):
@@ -60,27 +53,33 @@ def as_batch(observations):
             for key in observations[0]}
 
 
-def actions(agent, observations, generators=None):
-    """Actions (B, 9): sampled with a generator per episode or, without any, the policy's means."""
-    mean, log_std, _ = agent(as_batch(observations))
-    if generators is None:
-        return mean.numpy()
-    std = log_std.exp().numpy()
-    return [m + std * generator.standard_normal(9)
-            for m, generator in zip(mean.numpy(), generators)]
+def actions(agent, observations):
+    """Actions (B, 9): the policy's means."""
+    mean, _, _ = agent(as_batch(observations))
+    return mean.numpy()
+
+
+def in_chunks(episodes):
+    """A range of episodes as ranges of at most CHUNK, which are played side by side."""
+    return [episodes[first:first + CHUNK] for first in range(0, len(episodes), CHUNK)]
+
+
+def play(checkpoint, agent, distractors, episodes):
+    """Play `episodes` (a range), chunk by chunk: the info of each last step."""
+    return [end for chunk in in_chunks(episodes)
+            for end in play_chunk(checkpoint, agent, distractors, chunk)]
 
 
 @torch.inference_mode()
-def play(checkpoint, agent, distractors, episodes, sample_actions=False):
-    """Play `episodes` (a range) side by side to their ends: the info of each last step."""
+def play_chunk(checkpoint, agent, distractors, episodes):
+    """Play `episodes` side by side to their ends: the info of each last step."""
     envs = [make_env(checkpoint["task"], distractors, checkpoint["settings"]) for _ in episodes]
     observations = [env.reset(seed=episode_seed(episode))[0]
                     for env, episode in zip(envs, episodes)]
-    generators = noise_of(episodes) if sample_actions else None
     ends = [None] * len(envs)
     while None in ends:
         # Ended ones stay in the batch: a smaller one may round differently.
-        for e, action in enumerate(actions(agent, observations, generators)):
+        for e, action in enumerate(actions(agent, observations)):
             if ends[e] is None:
                 observations[e], _, _, truncated, info = envs[e].step(action)
                 if truncated:
@@ -90,20 +89,15 @@ def play(checkpoint, agent, distractors, episodes, sample_actions=False):
     return ends
 
 
-def in_chunks(episodes):
-    """A range of episodes as ranges of at most CHUNK, which are played side by side."""
-    return [episodes[first:first + CHUNK] for first in range(0, len(episodes), CHUNK)]
-
-
 # ---- the sweep over N
 
-def play_chunk(content, *arguments):
+def work(content, distractors, episodes):
     """play() in a process of its own. `content`: a checkpoint's bytes; its file may change."""
     torch.set_num_threads(1)
-    return play(*load(io.BytesIO(content)), *arguments)
+    return play(*load(io.BytesIO(content)), distractors, episodes)
 
 
-def sweep(content, numbers, episodes, sample_actions=False):
+def sweep(content, numbers, episodes):
     """Play a checkpoint (bytes) at every N in `numbers`, chunk by chunk on all cores.
 
     Prints and returns rows of COLUMNS, each as soon as its N is done. BrokenProcessPool if a worker
@@ -115,7 +109,7 @@ def sweep(content, numbers, episodes, sample_actions=False):
     print("   N  success           strict            solved", flush=True)
     rows, begin = [], time.monotonic()
     ctrl_c = signal.signal(signal.SIGINT, signal.SIG_IGN)      # for this process, not the workers
-    played = {n: [pool.submit(play_chunk, content, n, part, sample_actions) for part in parts]
+    played = {n: [pool.submit(work, content, n, part) for part in parts]
               for n in numbers}
     signal.signal(signal.SIGINT, ctrl_c)
     try:
@@ -171,35 +165,34 @@ def evaluate(run, args):
           f"{checkpoint['distractors']} distractors, {checkpoint['frames']} frames")
     with open(file, "rb") as opened:
         content = opened.read()
-    rows = sweep(content, numbers, args.episodes, args.sample_actions)
+    rows = sweep(content, numbers, args.episodes)
     if args.save:
         if load(file)[0]["update"] != checkpoint["update"]:
             raise ValueError(f"{run} was trained on meanwhile: its scores are not saved")
-        name = "zeroshot-sampled.csv" if args.sample_actions else "zeroshot.csv"
-        with open(os.path.join(run, name), "w", newline="") as opened:
+        path = os.path.join(run, "zeroshot.csv")
+        with open(path, "w", newline="") as opened:
             writer = csv.DictWriter(opened, COLUMNS, lineterminator="\n")
             writer.writeheader()
             writer.writerows({key: f"{value:.4f}" if isinstance(value, float) else value
                               for key, value in row.items()} for row in rows)
-        print(f"wrote {os.path.join(run, name)}")
+        print(f"wrote {path}")
 
 
 # ---- watching
 
-def play_live(agent, env, episode, sample_actions):
+def play_live(agent, env, episode):
     """Play one evaluation episode; yields the info at the start and after every step."""
-    generators = noise_of([episode]) if sample_actions else None
     obs, info = env.reset(seed=episode_seed(episode))
     yield info
     truncated = False
     while not truncated:
-        [action] = actions(agent, [obs], generators)
+        [action] = actions(agent, [obs])
         obs, _, _, truncated, info = env.step(action)
         yield info
 
 
 @torch.inference_mode()
-def watch(run, distractors, episodes, sample_actions):
+def watch(run, distractors, episodes):
     """Play episodes in PyBullet's window, in real time, until it is closed or Ctrl-C."""
     checkpoint, agent = load(run)
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
@@ -209,14 +202,14 @@ def watch(run, distractors, episodes, sample_actions):
     print(f"{run}, {distractors} distractors: target blue, goal green; Ctrl-C stops", flush=True)
     try:
         for episode in range(episodes):
-            for info in play_live(agent, env, episode, sample_actions):
+            for info in play_live(agent, env, episode):
                 pass
             print(f"episode {episode}: success {info['fractional_success']:.2f}", flush=True)
     except pybullet.error:
         print("the window was closed")
 
 
-def shoot(checkpoint, agent, distractors, episode, sample_actions):
+def shoot(checkpoint, agent, distractors, episode):
     """An evaluation episode: pictures (300, 400, 3) with captions, and ms from one to the next."""
     env = make_env(checkpoint["task"], distractors, checkpoint["settings"], "rgb_array")
     seconds = env.substeps * env.timestep                      # of an action
@@ -225,7 +218,7 @@ def shoot(checkpoint, agent, distractors, episode, sample_actions):
     if not checkpoint["settings"]["crowd"]:
         name += " without crowds"
     shots = []
-    for step, info in enumerate(play_live(agent, env, episode, sample_actions)):
+    for step, info in enumerate(play_live(agent, env, episode)):
         is_sound = info.get("truncated_by") != DIVERGED        # else there is no picture
         if is_sound and (step % every == 0 or "truncated_by" in info):
             score = info["fractional_success"]
@@ -235,7 +228,7 @@ def shoot(checkpoint, agent, distractors, episode, sample_actions):
 
 
 @torch.inference_mode()
-def film(runs, distractors, episodes, sample_actions, path):
+def film(runs, distractors, episodes, path):
     """Write evaluation episodes as an animated GIF, the runs side by side from the same starts."""
     try:
         from PIL import Image, ImageDraw
@@ -243,14 +236,13 @@ def film(runs, distractors, episodes, sample_actions, path):
         raise ValueError("--gif needs pillow: pip install pillow") from None
     agents, pictures = [load(run) for run in runs], []
     for episode in range(episodes):
-        panels, periods = zip(*[shoot(*agent, distractors, episode, sample_actions)
-                                for agent in agents])
+        panels, periods = zip(*[shoot(*agent, distractors, episode) for agent in agents])
         length = max(map(len, panels)) + 10                    # the end is shown for a while
         panels = [shots + shots[-1:] * (length - len(shots)) for shots in panels]
         for moment in zip(*panels):
             picture = Image.fromarray(np.concatenate([shot for shot, _ in moment], axis=1))
             for panel, (_, caption) in enumerate(moment):
-                place = PICTURE[0] * panel + 8, 6
+                place = PICTURE[0] * panel + 8, PICTURE[1] - 24
                 ImageDraw.Draw(picture).text(place, caption, "black", font_size=16)
             pictures.append(picture)
     colors = pictures[0].quantize(64)                          # the same in all: nothing flickers
@@ -284,11 +276,8 @@ def read_command():
              "the smallest of them (default: as trained)")
     add("--episodes", type=int, metavar="E",
         help="episodes at each N (default 200), or of a film (default 3)")
-    add("--sample-actions", action="store_true",
-        help="sample actions as in training instead of playing the policy's means")
     add = parser.add_mutually_exclusive_group().add_argument
-    add("--save", action="store_true",
-        help="write the rows to RUN/zeroshot.csv (zeroshot-sampled.csv for sampled actions)")
+    add("--save", action="store_true", help="write the rows to RUN/zeroshot.csv")
     add("--watch", action="store_true", help="play the first run live in a window")
     add("--gif", metavar="FILE.gif", help="film the runs side by side")
     args = parser.parse_args()
@@ -306,9 +295,9 @@ def main():
             run = args.runs[0]
             distractors = args.distractors[0] if args.distractors else load(run)[0]["distractors"]
             if args.gif:
-                film(args.runs, distractors, args.episodes, args.sample_actions, args.gif)
+                film(args.runs, distractors, args.episodes, args.gif)
             else:
-                watch(run, distractors, args.episodes, args.sample_actions)
+                watch(run, distractors, args.episodes)
             return
         for run in args.runs:
             evaluate(run, args)

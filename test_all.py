@@ -1736,34 +1736,29 @@ def simple(monkeypatch):
     return checkpoint
 
 
-def slow_play(task, settings, n, episodes, sample_actions):
+def slow_play(task, settings, n, episodes):
     """evaluate.play() as a plain loop, one episode after the other: successes and strict ones."""
     agent, results = Simple(), []
     for episode in episodes:
         seed = int(np.random.SeedSequence([20220131, episode, 0]).generate_state(1)[0])
-        other = np.random.SeedSequence([20220131, episode, 1])
-        noise = np.random.default_rng(int(other.generate_state(1)[0]))
         env = train.make_env(task, n, settings)
         obs, _ = env.reset(seed=seed)
         truncated = False
         while not truncated:
             mean, _, _ = agent({key: torch.from_numpy(value[None]) for key, value in obs.items()})
-            action = mean[0].numpy()
-            if sample_actions:
-                action = action + math.exp(-1.0) * noise.standard_normal(9)
-            obs, _, _, truncated, info = env.step(action)
+            obs, _, _, truncated, info = env.step(mean[0].numpy())
         results.append((info["fractional_success"], info["fractional_success_strict"]))
         env.close()
     return np.array(results)
 
 
-@pytest.mark.parametrize("task, n, sample_actions", [
-    ("push", 0, False), ("push", 2, True), ("lift", 2, False)])
-def test_play_equals_a_plain_loop_over_episodes(simple, task, n, sample_actions):
+@pytest.mark.parametrize("task, n", [("push", 0), ("lift", 2)])
+def test_play_equals_a_plain_loop_over_episodes(simple, task, n, monkeypatch):
+    monkeypatch.setattr(evaluate, "CHUNK", 4)                  # two chunks: four episodes, and two
     simple["task"] = task
-    ends = evaluate.play(simple, Simple(), n, range(3, 9), sample_actions)
+    ends = evaluate.play(simple, Simple(), n, range(3, 9))
     ours = [(end["fractional_success"], end["fractional_success_strict"]) for end in ends]
-    expected = slow_play(task, simple["settings"], n, range(3, 9), sample_actions)
+    expected = slow_play(task, simple["settings"], n, range(3, 9))
     np.testing.assert_allclose(ours, expected, atol=1e-5)
     assert len(set(expected[:, 0])) > 2                        # of different episodes
 
@@ -1804,12 +1799,9 @@ def evaluated(tmp_path_factory):
 
 
 def test_the_table_and_its_csv_are_what_play_says(evaluated):
-    """27 episodes are two chunks: 25 side by side, and two."""
     folder, printed = evaluated
     checkpoint, agent = train.load(str(folder))
-    ends = [end for part in (range(25), range(25, 27))
-            for end in evaluate.play(checkpoint, agent, 3, part)]
-    expected = evaluate.summary(3, ends)
+    expected = evaluate.summary(3, evaluate.play(checkpoint, agent, 3, range(27)))
     rows = read_csv(folder / "zeroshot.csv")
     assert [row["distractors"] for row in rows] == [0, 3]
     assert rows[1] == pytest.approx(expected, abs=1e-4)
@@ -1820,32 +1812,13 @@ def test_the_table_and_its_csv_are_what_play_says(evaluated):
     assert max(map(len, printed[1:4])) <= 80
 
 
-class InThisProcess:
-    """Stands in for the pool of processes: what is submitted is done at once."""
-
-    def __init__(self, count, context):
-        pass
-
-    def submit(self, function, *arguments):
-        done = function(*arguments)
-        return SimpleNamespace(result=lambda: done)
-
-    def shutdown(self, cancel_futures):
-        pass
-
-
-def test_sampled_actions_are_saved_apart_and_only_if_asked_to(evaluated, tmp_path, monkeypatch):
+def test_scores_are_saved_only_if_asked_to(evaluated, tmp_path, monkeypatch):
     folder = shutil.copytree(evaluated[0], tmp_path / "run")
     before = files_in(folder)
-    monkeypatch.setattr(evaluate, "ProcessPoolExecutor", InThisProcess)
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    words = ["evaluate.py", str(folder), "--distractors", "0", "--episodes", "2"]
-    monkeypatch.setattr(sys, "argv", words)
+    monkeypatch.setattr(evaluate, "sweep", lambda *_: [])
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", str(folder)])
     evaluate.main()
     assert files_in(folder) == before
-    monkeypatch.setattr(sys, "argv", [*words, "--sample-actions", "--save"])
-    evaluate.main()
-    assert set(files_in(folder)) - set(before) == {"zeroshot-sampled.csv"}
 
 
 def children_of(parent, word):
@@ -1916,11 +1889,11 @@ def test_watching_plays_the_evaluated_episodes(simple, monkeypatch, capsys):
         assert render_mode == "human"
         return train.make_env(task, distractors, settings)
 
-    expected = slow_play("push", simple["settings"], 2, range(3), sample_actions=True)[:, 0]
+    expected = slow_play("push", simple["settings"], 2, range(3))[:, 0]
     monkeypatch.setattr(evaluate, "make_env", make_env)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     monkeypatch.setenv("DISPLAY", "none is opened")
-    evaluate.watch("simple", 2, 3, True)
+    evaluate.watch("simple", 2, 3)
     lines = capsys.readouterr().out.splitlines()[1:]
     assert [line.split()[-1] for line in lines] == [f"{rho:.2f}" for rho in expected]
 
@@ -1930,7 +1903,7 @@ def test_film_shows_episodes_side_by_side(substeps, pictures, milliseconds, simp
     """15 steps at 25 Hz: start, every other step, the end; at 6.25 Hz every step. Then a rest."""
     Image = pytest.importorskip("PIL.Image")
     simple["settings"]["substeps"] = substeps
-    evaluate.film(["simple", "simple"], 2, 2, False, str(tmp_path / "a.gif"))
+    evaluate.film(["simple", "simple"], 2, 2, str(tmp_path / "a.gif"))
     with Image.open(tmp_path / "a.gif") as film:
         shown, durations = [], []
         for i in range(film.n_frames):
@@ -1941,7 +1914,7 @@ def test_film_shows_episodes_side_by_side(substeps, pictures, milliseconds, simp
     assert len(shown) == 2 * pictures and durations[0] == milliseconds
     assert durations[pictures - 1] == 11 * milliseconds        # equal pictures become one
     for i in range(len(shown)):                                # the same run twice
-        assert np.abs(shown[i][30:, :400] - shown[i][30:, 400:]).max() == 0
+        assert np.abs(shown[i][:, :400] - shown[i][:, 400:]).max() == 0
     assert np.abs(shown[pictures - 1] - shown[0]).max() > 50
     assert np.abs(shown[pictures] - shown[0]).max() > 50       # another start
 

@@ -12,6 +12,7 @@ Data flow: observation -> a small MLP per type -> objects (B, K, D), goal (B, D)
 A run folder holds progress.csv, one row per update, and checkpoint.pt, saved after every update.
 """
 import argparse
+import contextlib
 import csv
 import fcntl
 import io
@@ -323,9 +324,8 @@ def add_row(path, row):
 
 def save(checkpoint, folder):
     """Replace the checkpoint of a run, and remove the scores of the weights before."""
-    for name in ("zeroshot.csv", "zeroshot-sampled.csv"):
-        if os.path.exists(os.path.join(folder, name)):
-            os.remove(os.path.join(folder, name))
+    with contextlib.suppress(FileNotFoundError):
+        os.remove(os.path.join(folder, "zeroshot.csv"))
     buffer = io.BytesIO()
     torch.save(checkpoint, buffer)
     replace(os.path.join(folder, "checkpoint.pt"), buffer.getvalue())

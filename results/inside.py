@@ -112,8 +112,7 @@ def distractors_share(agent, obs):
 
 def by_number(checkpoint, agent, N, episodes):
     """A row of the table by N: {column: number}."""
-    ends = [end for part in evaluate.in_chunks(range(episodes))
-            for end in evaluate.play(checkpoint, agent, N, part)]
+    ends = evaluate.play(checkpoint, agent, N, range(episodes))
     success = torch.tensor([end["fractional_success"] for end in ends])
     obs = starts(checkpoint, N, episodes)
     trained = starts(checkpoint, checkpoint["distractors"], episodes)

@@ -34,8 +34,7 @@ def scores_of(run):
 def compare(run, N, row):
     """Print a line."""
     checkpoint, agent = load(run)
-    ends = [end for part in evaluate.in_chunks(range(FIRST, FIRST + EPISODES))
-            for end in evaluate.play(checkpoint, agent, N, part)]
+    ends = evaluate.play(checkpoint, agent, N, range(FIRST, FIRST + EPISODES))
     again = evaluate.summary(N, ends)
     score, half = float(row["success"]), float(row["ci95"])
     is_within = abs(again["success"] - score) <= math.hypot(again["ci95"], half)

@@ -4,11 +4,10 @@
 
 The checkpoint loses its optimiser: it can be evaluated, not trained on. progress.csv keeps at most
 150 rows: each stands for a window of updates, with the window's last update, frames and lr, the sum
-of its episodes and the mean of everything else. zeroshot*.csv are copied as they are. A run that is
+of its episodes and the mean of everything else. zeroshot.csv is copied as it is. A run that is
 shipped already is refused.
 """
 import csv
-import glob
 import math
 import os
 import shutil
@@ -47,8 +46,8 @@ def thin_file(source, target):
 
 def ship(run):
     folder = os.path.join(HERE, "runs", os.path.basename(os.path.normpath(run)))
-    scores = glob.glob(os.path.join(run, "zeroshot*.csv"))
-    if not scores:
+    scores = os.path.join(run, "zeroshot.csv")
+    if not os.path.exists(scores):
         fail(f"{run} has no scores: python evaluate.py {run} --save first")
     if os.path.exists(os.path.join(folder, "checkpoint.pt")):
         fail(f"{folder} holds a run already: remove it first")
@@ -56,8 +55,7 @@ def ship(run):
     checkpoint, _ = load(run)
     checkpoint.pop("optimizer", None)
     thin_file(os.path.join(run, "progress.csv"), os.path.join(folder, "progress.csv"))
-    for path in scores:
-        shutil.copy(path, folder)
+    shutil.copy(scores, folder)
     torch.save(checkpoint, os.path.join(folder, "checkpoint.pt"))          # last: now it is shipped
 
 
