@@ -178,8 +178,7 @@ class PPO(nn.Module):
 
     def bootstrap_values(self, values, final_observations):
         """V(s_{t+1}) (T, E): the next row of `values`, or the value of a final observation."""
-        # Row t+1 moves to row t. That is wrong where an episode ended and in the last row; play()
-        # kept a final observation for each of those, and its value goes there.
+        # Wrong where an episode ended and in the last row: there goes a final observation's value.
         next_values = values.roll(-1, dims=0)
         observations = final_observations.values()
         finals = {key: torch.from_numpy(np.stack([final[key] for final in observations]))

@@ -4,7 +4,7 @@ PyBullet, a hand-computed case, finite differences. In the order of the paper.
 Run:    pytest -q                            about 2 minutes
         python results/defects.py            plants a hundred defects; each has to turn a test red
 """
-import ast
+import contextlib
 import copy
 import csv
 import glob
@@ -13,7 +13,6 @@ import itertools
 import math
 import multiprocessing
 import os
-import pickle
 import re
 import runpy
 import shutil
@@ -53,13 +52,6 @@ def same_numbers():
     torch.manual_seed(0)
 
 
-def is_uniform(values, low=0.0, high=1.0):
-    """Chi-square test: with 9 degrees of freedom 27.9 is exceeded by chance once in 1000."""
-    counts, _ = np.histogram(values, 10, (low, high))
-    expected = len(values) / 10
-    return counts.sum() == len(values) and (np.square(counts - expected) / expected).sum() < 27.9
-
-
 def equally_likely(values, count):
     """Chi-square test: are 0 ... count - 1 equally likely? Once in 1000 it says no by chance."""
     expected = len(values) / count
@@ -80,8 +72,8 @@ def files_in(folder):
 
 def run(*command, **more):
     """A script of the project in a process of its own; output as text."""
-    return subprocess.run([sys.executable, *map(str, command)], cwd=HERE, timeout=120,
-                          capture_output=True, text=True, **more)
+    return subprocess.run([sys.executable, *map(str, command)], timeout=120, capture_output=True,
+                          text=True, **{"cwd": HERE, **more})
 
 
 class Fork(multiprocessing.get_context("fork").Process):
@@ -259,11 +251,6 @@ def world(request):
     return make
 
 
-def about_z(angle):
-    """Quaternion of a turn about the vertical axis."""
-    return 0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)
-
-
 def put(env, cube, position, quaternion=STILL, velocity=(0, 0, 0), spin=(0, 0, 0)):
     """Place cube number `cube` somewhere."""
     body = env._cubes[cube]
@@ -334,21 +321,19 @@ def test_kinematics_against_pybullet_undone_and_by_hand(world):
         assert math.dist(*pair) == pytest.approx(math.sqrt(3) * math.hypot(x, y), abs=1e-5)
 
 
-@pytest.mark.parametrize("options, cube_mass, finger_friction", [
-    ({}, 0.08, 1.0), ({"cube_mass": 0.02, "finger_friction": 0.1}, 0.02, 0.1)])
-def test_masses_and_friction(world, options, cube_mass, finger_friction):
+def test_masses_and_friction(world):
     """Numbers of TriFingerEdu's URDF, as PyBullet has taken them up; only lower links can touch."""
-    env = world(**options)
+    env = world(cube_mass=0.02, finger_friction=0.1)
     masses = (0.14854, 0.14854, 0.0407)
     inertias = ((3e-5, 4.1e-4, 4.1e-4), (4.1e-4, 4.1e-4, 3e-5), (1.6e-4, 1.6e-4, 1e-5))
     centres = ((-0.079, 0, 0), (0, -0.019, -0.079), (0, -0.00875, -0.1065))
     for finger, j in itertools.product(env._fingers, range(3)):
         mass, friction, inertia, centre, *_ = pb.getDynamicsInfo(finger, j, **env._world)
-        assert (mass, friction) == pytest.approx((masses[j], finger_friction))
+        assert (mass, friction) == pytest.approx((masses[j], 0.1))
         assert inertia == pytest.approx(inertias[j]) and centre == pytest.approx(centres[j])
         assert len(pb.getCollisionShapeData(finger, j, **env._world)) == (j == 2)
     for cube in env._cubes:
-        assert pb.getDynamicsInfo(cube, -1, **env._world)[:2] == (cube_mass, 1.0)
+        assert pb.getDynamicsInfo(cube, -1, **env._world)[:2] == (0.02, 1.0)
 
 
 @pytest.mark.parametrize("joint, low, high", [(0, -1.57, 1.0), (1, -1.2, 1.57), (2, -3.0, 3.0)])
@@ -444,46 +429,6 @@ def test_torques_follow_causalworlds_law(world):
     assert 0.1 < np.mean(cut) < 0.5                            # both cuts were needed
 
 
-def one_robot(env):
-    """One robot of nine joints in place of the three fingers, from the module's tables."""
-    only(env)
-    places, turns = list(tri.JOINT_PLACE * 3), [STILL] * 9
-    for k in range(3):
-        places[3 * k], turns[3 * k] = tri.FINGER_MOUNT[k], about_z(tri.FINGER_YAW[k])
-    robot = pb.createMultiBody(
-        0, -1, -1, [0, 0, 0], linkMasses=tri.MASS * 3, linkCollisionShapeIndices=[-1] * 9,
-        linkVisualShapeIndices=[-1] * 9, linkPositions=places, linkOrientations=turns,
-        linkInertialFramePositions=tri.CENTRE_OF_MASS * 3,
-        linkInertialFrameOrientations=[STILL] * 9, linkParentIndices=[0, 1, 2, 0, 4, 5, 0, 7, 8],
-        linkJointTypes=[pb.JOINT_REVOLUTE] * 9, linkJointAxis=tri.JOINT_AXIS * 3, **env._world)
-    for j in range(9):
-        pb.changeDynamics(robot, j, localInertiaDiagonal=tri.INERTIA[j % 3], linearDamping=0,
-                          angularDamping=0, jointDamping=0, **env._world)
-        pb.resetJointState(robot, j, REST[j % 3], 0.0, **env._world)
-    return robot
-
-
-def test_three_fingers_move_as_one_robot_of_nine_joints_does(world):
-    """The base is fixed, so the dynamics are the same, to rounding, once the solver is done."""
-    three, one = world(distractors=0), world(distractors=0)
-    only(three, *three._fingers)
-    robot, rng, target = one_robot(one), np.random.default_rng(0), np.array(REST * 3)
-    for env in (three, one):
-        pb.setPhysicsEngineParameter(numSolverIterations=500, solverResidualThreshold=0,
-                                     **env._world)
-    for _ in range(20):
-        target = target + rng.uniform(-0.1, 0.1, 9)
-        drive(three, target)
-        pb.setJointMotorControlArray(
-            robot, range(9), pb.POSITION_CONTROL, targetPositions=target.tolist(),
-            positionGains=[12.5 * 0.008] * 9, forces=[0.36] * 9, **one._world)
-        for _ in range(5):
-            pb.stepSimulation(**one._world)
-        states = pb.getJointStates(robot, range(9), **one._world)
-        np.testing.assert_allclose(joints(three)[0], [q for q, *_ in states], atol=1e-10)
-    assert np.abs(joints(three)[0] - REST * 3).max() > 0.2     # the fingers have moved
-
-
 def test_fingers_at_full_speed_do_not_pass_through_cubes(world):
     """2 m/s in steps of 8 ms: how deep in a cube is a tip's centre? A cube is 65 mm wide."""
     env, rng = world(substeps=1), np.random.default_rng(0)
@@ -500,20 +445,6 @@ def test_fingers_at_full_speed_do_not_pass_through_cubes(world):
     assert touched > 50 and deepest < 0.005, (touched, deepest)
 
 
-def test_a_slow_push_carries_a_cube_as_far_in_long_steps_as_in_short_ones(world):
-    """Finger 0 pushes along x for a second, at 0.1 m/s."""
-    ends = []
-    for timestep in (0.002, 0.008):
-        env = world(distractors=0, substeps=1, timestep=timestep)
-        put(env, 0, (0, 0, CUBE / 2))
-        xs = np.arange(-0.065, 0.035, 0.1 * timestep)
-        set_joints(env, [*reach(0, (xs[0], 0.01, 0.035)), *AWAY, *AWAY])
-        for x in xs:
-            drive(env, [*reach(0, (x, 0.01, 0.035)), *AWAY, *AWAY])
-        ends.append(pose_of(env, 0)[0])
-    assert ends[0][0] > 0.04 and math.dist(*ends) < 0.015
-
-
 def grips(world, tries, **options):
     """How many of some tries hold a cube for 10 s? Three tips close round it, press and rise to
     0.15 m; then their targets stay."""
@@ -523,7 +454,7 @@ def grips(world, tries, **options):
         rng = np.random.default_rng(seed)
         env.reset(seed=seed)
         x, y = rng.uniform(-0.015, 0.015, 2)
-        put(env, 0, (x, y, CUBE / 2), about_z(rng.uniform(-0.8, 0.8)))
+        put(env, 0, (x, y, CUBE / 2), tri.yaw_quaternion(rng.uniform(-0.8, 0.8)))
         pressed, low = CUBE / 2 - rng.uniform(0.015, 0.03), rng.uniform(0.025, 0.04)
         bearings = np.array(tri.FINGER_YAW) + math.pi + rng.uniform(-0.2, 0.2)
         path = [(0.075, low)] * second
@@ -568,17 +499,15 @@ OCTAGON = 2 * (math.sqrt(2) - 1)         # what a square shares with itself turn
 
 
 @pytest.mark.parametrize("place, yaw, aabb, strict", [
-    ((0, 0, 0), 0, 1.0, 1.0),
-    ((0.2, 0, 0), 0, 0.8, 0.8),
-    ((0.5, 0.5, 0.5), 0, 0.125, 0.125),
-    ((1, 0, 0), 0, 0.0, 0.0),
+    ((0.5, 0.5, 0.2), 0, 0.2, 0.2),
+    ((2, 2, 0), 0, 0.0, 0.0),                                  # apart along two axes
     ((0, 0, 0), math.pi / 4, 1.0, OCTAGON),
     ((0.15, 0, 0), math.pi / 4, 1.0, None),                    # lenient: still 1.0, 1 cm off
 ])
 def test_overlap_by_hand(place, yaw, aabb, strict):
     """Cubes shifted in units of their edge, and turned. (A grid at 45 degrees errs most.)"""
     goal = (0.02, -0.03, 0.1), STILL
-    cube = tuple(np.add(goal[0], np.multiply(CUBE, place))), about_z(yaw)
+    cube = tuple(np.add(goal[0], np.multiply(CUBE, place))), tri.yaw_quaternion(yaw)
     assert tri.aabb_overlap(cube, goal) == pytest.approx(aabb, abs=1e-9)
     assert strict is None or tri.oriented_overlap(cube, goal) == pytest.approx(strict, abs=0.025)
 
@@ -610,7 +539,7 @@ def test_success_is_measured_on_the_target_and_strictly_when_time_is_up(world):
         env.reset(seed=seed)
         for cube in range(3):
             put(env, cube, (0.15, 0.1 * (-1) ** cube, 0.2))
-        put(env, env.target, env.goal[0], about_z(math.pi / 4))
+        put(env, env.target, env.goal[0], tri.yaw_quaternion(math.pi / 4))
         for ended in (False, False, True):
             _, _, terminated, truncated, info = env.step(np.zeros(9))
             assert (terminated, truncated) == (False, ended)
@@ -659,8 +588,10 @@ def test_goals_are_uniform_where_a_finger_can_get_behind_them(world):
     goals, targets, others = map(np.array, (goals, targets, others))
     for ours, by_hand in ((goals[:, 0], x), (goals[:, 1], y),
                           (np.hypot(*goals[:, :2].T), np.hypot(x, y))):
-        assert is_uniform(np.searchsorted(np.sort(by_hand[free]), ours) / free.sum())
-    assert is_uniform(goals[:, 2], CUBE / 2, 0.2)              # heights in lifting
+        share = np.searchsorted(np.sort(by_hand[free]), ours) / (free.sum() + 1)
+        assert equally_likely((10 * share).astype(int), 10)
+    share = (goals[:, 2] - CUBE / 2) / (0.2 - CUBE / 2)        # heights in lifting
+    assert equally_likely((10 * share).astype(int), 10)
     assert np.abs(goals[:, 3]).max() == pytest.approx(0.3, abs=0.01)
     assert 0.12 < np.hypot(*targets[:, :2].T).max() < 0.124
     assert np.mean(np.hypot(*others[:, :2].T) > 0.124) > 0.55  # anywhere in the arena
@@ -689,9 +620,7 @@ def test_the_goal_names_the_target_and_no_other_cube(world, n):
         assert len(set(identifiers)) == n + 1
         drawn.append(env.target)
         used += identifiers.tolist()
-    counts = np.bincount(drawn, minlength=n + 1)
-    chi_square = np.square(counts - 300 / (n + 1)).sum() / (300 / (n + 1))
-    assert chi_square <= n + 4 * math.sqrt(2 * n), counts
+    assert n == 0 or equally_likely(drawn, n + 1)
     assert {round(10 * identifier) for identifier in used} == set(range(-10, 11))
 
 
@@ -733,7 +662,8 @@ def test_same_seed_same_trajectory_bit_for_bit(world):
 def test_observation_is_table_1(world):
     """Every entry against PyBullet's own state, with the scaling undone by hand."""
     env = world(seed=3)
-    put(env, 0, (0.02, 0.03, 0.2), about_z(1.2 * math.pi), (0.1, 0.2, -0.3), spin=(3, 2, 1))
+    put(env, 0, (0.02, 0.03, 0.2), tri.yaw_quaternion(1.2 * math.pi), velocity=(0.1, 0.2, -0.3),
+        spin=(3, 2, 1))
     put(env, 1, (-0.05, 0.01, 0.3), velocity=(-0.3, 0.1, 0.2), spin=(-1, 2, -3))
     obs, *_ = env.step(np.linspace(-1, 1, 9))
     pose_units = [1, *[0.065] * 3, *[0.2] * 3, *[1] * 4]       # 0.065 m, 0.2 m, ... are 1
@@ -744,9 +674,6 @@ def test_observation_is_table_1(world):
         linear, angular = pb.getBaseVelocity(env._cubes[cube], **env._world)
         expected = [1, *[0.065] * 3, *position, *turn, *linear, *angular, env._ids[cube]]
         np.testing.assert_allclose(row, expected, atol=1e-5)
-        for columns, value in ((tri.SIZE, [0.065] * 3), (tri.POSITION, position), (
-                tri.QUATERNION, turn), (tri.LINEAR, linear), (tri.ANGULAR, angular)):
-            np.testing.assert_allclose(row[columns], value, atol=1e-5)
     rows, (q, dq, _) = obs["fingers"] * [*[1.5] * 3, *[10] * 3, 1, *[0.2] * 3], joints(env)
     set_joints(env, env._joint_targets)
     for k, row in enumerate(rows):                             # the tip: where it is told to be
@@ -847,32 +774,15 @@ def test_diverged_physics_end_the_episode_and_the_next_one_is_sound(world, kind)
     assert all(np.isfinite(value).all() for value in obs.values())
 
 
-def test_full_speed_this_way_and_that_neither_diverges_nor_eats_memory(world):
-    resource = pytest.importorskip("resource")                 # not on Windows
-    env, rng, peaks = world(task="lift", distractors=9), np.random.default_rng(0), []
-    for step in range(1000):
-        if step % 10 == 0:
-            action = np.sign(rng.uniform(-1, 1, 9))
-        obs, reward, _, truncated, info = env.step(action)
-        assert math.isfinite(reward) and all(np.isfinite(value).all() for value in obs.values())
-        if truncated:
-            assert info["truncated_by"] != "the physics diverged"
-            env.reset(seed=step if step % 2 else None)
-            peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-    assert peaks[-1] - peaks[0] < 3 * 1024, peaks              # KiB
-
-
 @pytest.mark.parametrize("arguments", [
-    {"task": "fly"}, {"distractors": -1}, {"distractors": 1.5}, {"distractors": 21},
-    {"episode_steps": 0}, {"substeps": 0}, {"timestep": 0.0},
-    {"action_mode": "delta"}, {"motor": "steam"}, {"cube_mass": -0.08},
-    {"finger_friction": 0.0}, {"render_mode": "ascii"}], ids=str)
+    {"task": "fly"}, {"distractors": 1.5}, {"distractors": 21}, {"timestep": 0.0},
+    {"action_mode": "delta"}, {"motor": "steam"}, {"render_mode": "ascii"}], ids=str)
 def test_bad_arguments_are_refused_by_name(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         TriFingerEnv(**arguments)
 
 
-def test_bad_actions_copies_and_use_after_close_are_refused(world):
+def test_copies_and_use_after_close_are_refused(world):
     env = TriFingerEnv(distractors=0)
     for _ in range(2):                                         # before reset(), and when closed
         for use in (lambda: env.step(np.zeros(9)), env.render):
@@ -883,12 +793,8 @@ def test_bad_actions_copies_and_use_after_close_are_refused(world):
     with pytest.raises(RuntimeError, match="closed"):
         env.reset()
     env = world(distractors=0)
-    for action in (np.zeros(8), np.zeros((2, 9)), 3, "left"):
-        with pytest.raises(ValueError):
-            env.step(action)
-    for duplicate in (copy.deepcopy, pickle.dumps):
-        with pytest.raises(TypeError, match="cannot be copied"):
-            duplicate(env)
+    with pytest.raises(TypeError, match="cannot be copied"):
+        copy.deepcopy(env)
 
 
 def test_picture_shows_target_goal_and_distractors_in_their_colours(world):
@@ -909,23 +815,13 @@ def test_picture_shows_target_goal_and_distractors_in_their_colours(world):
 
 @pytest.mark.filterwarnings("ignore:.*not having a spec", "ignore:.*is.*infinity")
 def test_gymnasium_takes_the_environment():
-    """Alone, by its names, and several at once: the same as one by one."""
     gymnasium = pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
-    with gymnasium.make("TriFingerLift-v0", distractors=0) as env:
-        assert env.unwrapped.task == "lift"
+    for name, task in (("TriFingerPush-v0", "push"), ("TriFingerLift-v0", "lift")):
+        with gymnasium.make(name, distractors=0) as env:
+            assert env.unwrapped.task == task
     with TriFingerEnv() as env:
         check_env(env)
-    both = gymnasium.make_vec("TriFingerPush-v0", num_envs=2, distractors=1)
-    both.reset(seed=[3, 4])
-    obs, rewards, *_ = both.step(np.full((2, 9), 0.5, np.float32))
-    both.close()
-    for e, seed in enumerate((3, 4)):
-        with TriFingerEnv(distractors=1) as alone:
-            alone.reset(seed=seed)
-            expected, reward, *_ = alone.step(np.full(9, 0.5))
-        assert rewards[e] == pytest.approx(reward)
-        assert all(np.array_equal(obs[key][e], expected[key]) for key in expected)
 
 
 def test_stable_baselines_trains_on_the_environment(world):
@@ -944,9 +840,8 @@ def test_environment_is_the_same_without_gymnasium():
               "obs, *_ = env.step(numpy.ones(9)); print(hasattr(env, 'action_space'));"
               "print(obs['cubes'].tobytes().hex())")
     blocked = "import sys; sys.modules['gymnasium'] = None;"   # import gymnasium fails
-    with_it, without_it = (
-        subprocess.run([sys.executable, "-c", first + script], cwd=HERE, capture_output=True,
-                       text=True, timeout=60).stdout.splitlines()[-2:] for first in ("", blocked))
+    with_it, without_it = (run("-c", first + script).stdout.splitlines()[-2:]
+                           for first in ("", blocked))
     assert with_it[0] == "True" and without_it[0] == "False" and with_it[1] == without_it[1]
 
 
@@ -1190,16 +1085,6 @@ def test_an_update_is_three_steps_of_adam_on_clipped_gradients():
         torch.testing.assert_close(ours, expected, atol=1e-5, rtol=1e-4)
 
 
-def test_a_gradient_that_is_not_finite_is_refused_and_the_weights_stay():
-    learner = learner_of(TinyAgent(), PointOnLine(), steps=16)
-    learner.rollout([0])
-    learner.batch["returns"][3] = math.nan
-    before = nn.utils.parameters_to_vector(learner.agent.parameters())
-    with pytest.raises(FloatingPointError):
-        learner.update(1.0)
-    assert torch.equal(before, nn.utils.parameters_to_vector(learner.agent.parameters()))
-
-
 def compare_with_the_joined_batch(rank, store):
     """One of two ranks: the gradient from its half of a batch, and from the whole of it."""
     dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)
@@ -1357,12 +1242,6 @@ def test_half_of_the_minibatches_show_a_crowd_if_there_can_be_one(encoder, N, cr
 
 # ---------------------------------------------------------------- seeds and settings
 
-def test_derived_seeds_do_not_repeat_where_sums_would():
-    seeds = {train.derived_seed(*numbers) for numbers in np.ndindex(12, 12, 12)}
-    assert len(seeds) == 12 ** 3
-    assert train.derived_seed(0, 1, 2) == 3_884_055_042        # on every machine
-
-
 def test_ranks_share_their_crowds_but_neither_episodes_nor_noise():
     """Four environments on one rank or on two: the same seeds in all."""
     episodes, noises, crowds, agent = [], [], [], agent_of()
@@ -1443,14 +1322,8 @@ def test_a_new_term_of_the_reward_gets_a_setting_by_itself(monkeypatch):
     assert fresh["SETTINGS"]["reward_mine"][:2] == (7.0, 0.0)  # default, and with --paper
     env = fresh["make_env"]("push", 0, {**fresh["DEFAULTS"], "reward_mine": 8.0})
     assert env.reward_weights["mine"] == 8.0
-
-
-@pytest.mark.parametrize("weights", [{**tri.REWARD_WEIGHTS, "mine": 7.0}, {"overlap": 1.0}])
-def test_a_weight_without_its_formula_or_the_other_way_round_is_an_error(monkeypatch, weights):
-    monkeypatch.setattr(tri, "REWARD_WEIGHTS", weights)
-    env = TriFingerEnv()
     env.reset(seed=0)
-    with pytest.raises(KeyError):
+    with pytest.raises(KeyError):                              # it has no formula yet
         env.step(np.zeros(9))
 
 
@@ -1519,7 +1392,7 @@ class DeepSet(nn.Module):
         return self.out(torch.cat([objects.mean(dim=1), goal], dim=1))
 
 
-@pytest.mark.parametrize("encoder", ["lrn-objects", "rn", "attn", "mlp", "deepset"])
+@pytest.mark.parametrize("encoder", ["mlp", "deepset"])
 def test_every_encoder_trains_and_one_of_ones_own_is_one_line(encoder, tmp_path, monkeypatch):
     monkeypatch.setitem(train.ENCODERS, "deepset", DeepSet)          # the line
     assert command("--encoder", encoder, "--out", tmp_path, *SMALL, "frames=50").end()[0] == 0
@@ -1552,33 +1425,29 @@ def started(*words):
     return process
 
 
-def killed(out, monkeypatch, owner, name, call, after=False):
-    """The folder of a run like `finished` that was killed as it called a function the nth time."""
-    function, calls = getattr(owner, name), []
+def killed(out, monkeypatch):
+    """The folder of a run like `finished` that was killed in its third update.
 
-    def deadly(*arguments):
-        calls.append(arguments)
-        result = function(*arguments) if after or len(calls) < call else None
-        if len(calls) == call:
+    At the sixth fsync: its row is written by then, its checkpoint is half written.
+    """
+    fsync, calls = os.fsync, []
+
+    def deadly(file):
+        calls.append(file)
+        if len(calls) == 6:
             os.kill(os.getpid(), signal.SIGKILL)
-        return result
+        fsync(file)
 
     with monkeypatch.context() as patch:
-        patch.setattr(owner, name, deadly)
+        patch.setattr(os, "fsync", deadly)
         assert command("--out", out, *SMALL).end()[0] == -signal.SIGKILL
     return out
 
 
-@pytest.mark.parametrize("owner, name, call, after, saved", [
-    (PPO, "minibatch_step", 37, False, 2),                     # 15 in an update
-    (train, "save", 3, False, 2),                              # its row is written by then
-    (os, "fsync", 7, False, 2),                                # its checkpoint is half written
-    (os, "replace", 4, True, 3)])                              # it is in place
-def test_killed_in_its_third_update_and_resumed_equals_never_stopped(
-        owner, name, call, after, saved, finished, tmp_path, monkeypatch):
+def test_killed_and_resumed_equals_never_stopped(finished, tmp_path, monkeypatch):
     """Rows beyond the checkpoint are cut, a torn one too; scores go with their weights."""
-    out = killed(tmp_path / "run", monkeypatch, owner, name, call, after)
-    assert checkpoint_of(out)["update"] == saved
+    out = killed(tmp_path / "run", monkeypatch)
+    assert checkpoint_of(out)["update"] == 2
     with open(out / "progress.csv", "a") as file:
         file.write("4,200,")
     (out / "zeroshot.csv").write_text("scores of these weights")
@@ -1609,20 +1478,6 @@ def test_one_process_at_a_time_trains_in_a_folder(tmp_path):
     assert "in use" not in command(*anew).end()[2]
 
 
-def test_a_run_is_not_overwritten_and_the_same_command_gives_the_same_run(finished, tmp_path):
-    first, second = shutil.copytree(finished, tmp_path / "first"), tmp_path / "second"
-    assert command("--out", first, *SMALL, "lr=0.1").end()[0] == 2
-    assert files_in(first) == files_in(finished)
-    assert command("--out", second, *SMALL).end()[0] == 0
-    assert_same_run(second, finished)
-
-
-def test_a_run_without_its_rows_is_not_resumed(finished, tmp_path):
-    shutil.copy(finished / "checkpoint.pt", tmp_path)
-    status, _, error = command("--resume", tmp_path).end()
-    assert status == 2 and error.count("\n") == 1
-
-
 def test_resuming_a_finished_run_changes_nothing(finished, tmp_path):
     shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
     (tmp_path / "zeroshot.csv").write_text("scores of these weights")
@@ -1631,10 +1486,11 @@ def test_resuming_a_finished_run_changes_nothing(finished, tmp_path):
 
 
 def test_a_diverged_policy_ends_the_run_and_keeps_the_checkpoint(tmp_path, monkeypatch):
-    before = files_in(killed(tmp_path, monkeypatch, PPO, "minibatch_step", 37))
+    before = files_in(killed(tmp_path, monkeypatch))["checkpoint.pt"]
     monkeypatch.setattr(train.Agent, "auxiliary", lambda self, _: self.log_std.sum() * math.nan)
     status, _, error = command("--resume", tmp_path).end()
-    assert status == 1 and error.count("\n") == 1 and files_in(tmp_path) == before
+    assert status == 1 and error.count("\n") == 1
+    assert files_in(tmp_path)["checkpoint.pt"] == before
 
 
 def test_a_checkpoint_that_lacks_a_setting_takes_the_default(finished, tmp_path):
@@ -1661,35 +1517,31 @@ def bad(finished, tmp_path_factory):
     folder = tmp_path_factory.mktemp("bad")
     shutil.copytree(finished, folder / "good")
     (folder / "file").touch()
-    for name in ("code", "weights", "swapped", "half", "text", "empty"):
+    for name in ("code", "weights", "half"):
         (folder / name).mkdir()
         (folder / name / "progress.csv").touch()
     good = checkpoint_of(finished)
     torch.save(Evil(), folder / "code" / "checkpoint.pt")
-    torch.save({**good, "encoder": "attn"}, folder / "swapped" / "checkpoint.pt")
     del good["optimizer"]
     torch.save(good, folder / "weights" / "checkpoint.pt")
     half = (finished / "checkpoint.pt").read_bytes()[:5000]
     (folder / "half" / "checkpoint.pt").write_bytes(half)
-    (folder / "text" / "checkpoint.pt").write_text("no checkpoint")
     return folder
 
 
 @pytest.mark.parametrize("words", [
-    "--encoder gnn", "--task fly", "--seed -1", "--frames 7", "--distractors 21",
-    "--distractors two", "--set joy=1", "--set z_dim", "--set z_dim=0", "--set z_dim=2.5",
-    "--set anneal_clip=maybe", "--set lr=nan", "--set log_std=inf", "--set crowd=21",
-    "--set crowd=-1", "--set action_mode=torque", "--set minibatches=7", "--set steps=124",
-    "--out file", "--out good", "--resume nowhere", "--resume file", "--resume good --seed 3",
-    "--resume good --paper", "--resume weights", "--resume code", "--resume swapped",
-    "--resume half", "--resume text", "--resume empty"])
+    "--encoder gnn", "--seed -1", "--distractors 21", "--set joy=1", "--set z_dim",
+    "--set z_dim=0", "--set anneal_clip=maybe", "--set lr=nan", "--set crowd=21",
+    "--set action_mode=torque", "--set minibatches=7", "--set steps=124", "--out file",
+    "--out good", "--resume nowhere", "--resume file", "--resume good --seed 3",
+    "--resume weights", "--resume code", "--resume half"])
 def test_bad_input_ends_with_one_line_and_status_2(words, bad, monkeypatch):
     """It names the setting. Nothing is started or written, and no code of a checkpoint is run."""
     monkeypatch.chdir(bad)
     monkeypatch.setattr(train, "train", None)                  # to start would be an error
     before = {path: os.stat(path).st_mtime_ns for path in glob.glob("**", recursive=True)}
     status, _, error = command(*words.split()).end()
-    named = words.partition("--set ")[2].partition("=")[0]
+    named = re.search(r"--(?:set )?(\w+)", words)[1]
     assert status == 2 and error.count("\n") == 1 and named in error, error
     assert {path: os.stat(path).st_mtime_ns for path in glob.glob("**", recursive=True)} == before
 
@@ -1711,33 +1563,18 @@ class Simple(nn.Module):
         return 0.5 - fingers, self.log_std, fingers[:, 0]
 
 
-class Touchy(TriFingerEnv):
-    """Its success depends on every action of an episode, also where no cube is touched."""
-
-    def reset(self, **options):
-        self.felt = 0.0
-        return super().reset(**options)
-
-    def step(self, action):
-        *result, info = super().step(action)
-        self.felt = 0.9 * self.felt + np.sum(action) / 100
-        info["fractional_success"] += self.felt
-        return *result, info
-
-
 @pytest.fixture
 def simple(monkeypatch):
-    """A checkpoint whose agent is Simple and whose world is Touchy."""
+    """A checkpoint whose agent is Simple."""
     settings = {**train.DEFAULTS, "episode_steps": 15, "goal_yaw": 0.4}
     checkpoint = {"task": "push", "distractors": 1, "encoder": "lrn", "frames": 7, "update": 1,
                   "settings": settings}
     monkeypatch.setattr(evaluate, "load", lambda path: (checkpoint, Simple()))
-    monkeypatch.setattr(train, "TriFingerEnv", Touchy)
     return checkpoint
 
 
 def slow_play(task, settings, n, episodes):
-    """evaluate.play() as a plain loop, one episode after the other: successes and strict ones."""
+    """evaluate.play() as a plain loop, one episode after the other: the info of each last step."""
     agent, results = Simple(), []
     for episode in episodes:
         seed = int(np.random.SeedSequence([20220131, episode, 0]).generate_state(1)[0])
@@ -1747,27 +1584,22 @@ def slow_play(task, settings, n, episodes):
         while not truncated:
             mean, _, _ = agent({key: torch.from_numpy(value[None]) for key, value in obs.items()})
             obs, _, _, truncated, info = env.step(mean[0].numpy())
-        results.append((info["fractional_success"], info["fractional_success_strict"]))
+        results.append(info)
         env.close()
-    return np.array(results)
+    return results
 
 
 @pytest.mark.parametrize("task, n", [("push", 0), ("lift", 2)])
 def test_play_equals_a_plain_loop_over_episodes(simple, task, n, monkeypatch):
     monkeypatch.setattr(evaluate, "CHUNK", 4)                  # two chunks: four episodes, and two
     simple["task"] = task
-    ends = evaluate.play(simple, Simple(), n, range(3, 9))
-    ours = [(end["fractional_success"], end["fractional_success_strict"]) for end in ends]
     expected = slow_play(task, simple["settings"], n, range(3, 9))
-    np.testing.assert_allclose(ours, expected, atol=1e-5)
-    assert len(set(expected[:, 0])) > 2                        # of different episodes
-
-
-def test_evaluation_starts_belong_to_no_training_run():
-    evaluated = {evaluate.episode_seed(episode) for episode in range(200)}
-    trained_on = {train.derived_seed(seed, update, env) for seed in range(5)
-                  for update in range(100) for env in range(32)}
-    assert len(evaluated) == 200 and not evaluated & trained_on
+    reach = [info["rewards"]["reach"] for info in expected]    # depends on all actions before
+    assert len(set(reach)) == 6
+    assert evaluate.play(simple, Simple(), n, range(3, 9)) == expected
+    env = train.make_env(task, n, simple["settings"])
+    with torch.inference_mode():
+        assert list(evaluate.play_live(Simple(), env, 4))[-1] == expected[1]
 
 
 def test_summary_of_four_episodes_by_hand():
@@ -1782,7 +1614,7 @@ def test_summary_of_four_episodes_by_hand():
         "ci95": 1.96 * math.sqrt(spread / 3) / 2, "ci95_strict": 1.96 * math.sqrt(0.5 / 3) / 2,
         "solved": 0.5, "cut_short": 2}
     row = evaluate.summary(5, ends)
-    assert row == pytest.approx(expected) and tuple(row) == evaluate.COLUMNS
+    assert row == pytest.approx(expected)
     assert math.isnan(evaluate.summary(0, ends[:1])["ci95"])
 
 
@@ -1812,13 +1644,23 @@ def test_the_table_and_its_csv_are_what_play_says(evaluated):
     assert max(map(len, printed[1:4])) <= 80
 
 
-def test_scores_are_saved_only_if_asked_to(evaluated, tmp_path, monkeypatch):
+@pytest.mark.parametrize("words", [[], ["--save"]])
+def test_scores_are_not_saved_unasked_nor_if_the_run_trained_on_meanwhile(
+        evaluated, tmp_path, monkeypatch, words):
     folder = shutil.copytree(evaluated[0], tmp_path / "run")
-    before = files_in(folder)
-    monkeypatch.setattr(evaluate, "sweep", lambda *_: [])
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", str(folder)])
-    evaluate.main()
-    assert files_in(folder) == before
+    scores = folder / "zeroshot.csv"
+    before = scores.read_bytes()
+
+    def sweep(content, *_):
+        checkpoint = checkpoint_of(folder)
+        torch.save({**checkpoint, "update": 99 if words else 1}, folder / "checkpoint.pt")
+        return []
+
+    monkeypatch.setattr(evaluate, "sweep", sweep)
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", str(folder), *words])
+    with pytest.raises(SystemExit) if words else contextlib.nullcontext():
+        evaluate.main()
+    assert scores.read_bytes() == before
 
 
 def children_of(parent, word):
@@ -1828,26 +1670,23 @@ def children_of(parent, word):
     return [int(child) for child in children if word in open(f"/proc/{child}/cmdline").read()]
 
 
-@pytest.mark.parametrize("victim, status", [("main", 130), ("worker", 1)])
-def test_a_stop_ends_an_evaluation_with_one_line(evaluated, victim, status):
+def test_ctrl_c_ends_an_evaluation_with_one_line(evaluated):
     process = subprocess.Popen(
         [sys.executable, "evaluate.py", evaluated[0], "--episodes", "50"], cwd=HERE, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     while not process.stdout.readline().startswith("   0"):    # the first row; nine are to come
         pass
     workers = children_of(process.pid, "spawn_main")
-    if victim == "main":
-        process.send_signal(signal.SIGINT)
-    else:
-        os.kill(workers[0], signal.SIGKILL)
+    process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     lines = [line for line in errors.splitlines() if "build time" not in line]
-    assert process.returncode == status and len(lines) == 1, errors
+    assert process.returncode == 130 and len(lines) == 1, errors
     assert not any(os.path.exists(f"/proc/{worker}") for worker in workers)
 
 
 @pytest.mark.parametrize("words", [
-    ["nowhere"], ["RUN", "--distractors", "0-x"], ["RUN", "--distractors", "21"],
+    ["nowhere"], ["RUN", "--distractors", "0-x"], ["RUN", "--distractors", "3-2"],
+    ["RUN", "--distractors", "21"],
     ["RUN", "--episodes", "0"], ["RUN/checkpoint.pt", "--save"]])
 def test_bad_input_ends_an_evaluation_with_one_line(words, evaluated, monkeypatch, capsys):
     words = [word.replace("RUN", str(evaluated[0])) for word in words]
@@ -1858,50 +1697,16 @@ def test_bad_input_ends_an_evaluation_with_one_line(words, evaluated, monkeypatc
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-def test_scores_of_a_run_that_trained_on_meanwhile_are_not_saved(evaluated, tmp_path, monkeypatch,
-                                                                 capsys):
-    folder = shutil.copytree(evaluated[0], tmp_path / "run")
-    before = (folder / "zeroshot.csv").read_bytes()
-
-    def sweep(content, *_):
-        checkpoint = torch.load(folder / "checkpoint.pt", weights_only=True)
-        torch.save({**checkpoint, "update": 99}, folder / "checkpoint.pt")
-        return []
-
-    monkeypatch.setattr(evaluate, "sweep", sweep)
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", str(folder), "--save"])
-    with pytest.raises(SystemExit):
-        evaluate.main()
-    assert "trained on meanwhile" in capsys.readouterr().err
-    assert (folder / "zeroshot.csv").read_bytes() == before
-
-
 def test_ranges_of_distractors():
     assert evaluate.numbers("0-2,9,14") == [0, 1, 2, 9, 14]
-    for text in ("5-", "3-2", "x", ""):
-        with pytest.raises(ValueError):
-            evaluate.numbers(text)
-
-
-def test_watching_plays_the_evaluated_episodes(simple, monkeypatch, capsys):
-    """The window is replaced by none; what is printed is what play() says."""
-    def make_env(task, distractors, settings, render_mode=None):
-        assert render_mode == "human"
-        return train.make_env(task, distractors, settings)
-
-    expected = slow_play("push", simple["settings"], 2, range(3))[:, 0]
-    monkeypatch.setattr(evaluate, "make_env", make_env)
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    monkeypatch.setenv("DISPLAY", "none is opened")
-    evaluate.watch("simple", 2, 3)
-    lines = capsys.readouterr().out.splitlines()[1:]
-    assert [line.split()[-1] for line in lines] == [f"{rho:.2f}" for rho in expected]
 
 
 @pytest.mark.parametrize("substeps, pictures, milliseconds", [(5, 9, 80), (20, 16, 160)])
-def test_film_shows_episodes_side_by_side(substeps, pictures, milliseconds, simple, tmp_path):
+def test_film_shows_episodes_side_by_side(substeps, pictures, milliseconds, simple, tmp_path,
+                                          monkeypatch):
     """15 steps at 25 Hz: start, every other step, the end; at 6.25 Hz every step. Then a rest."""
     Image = pytest.importorskip("PIL.Image")
+    monkeypatch.setattr(evaluate, "PICTURE", (200, 150))        # soon drawn
     simple["settings"]["substeps"] = substeps
     evaluate.film(["simple", "simple"], 2, 2, str(tmp_path / "a.gif"))
     with Image.open(tmp_path / "a.gif") as film:
@@ -1910,11 +1715,11 @@ def test_film_shows_episodes_side_by_side(substeps, pictures, milliseconds, simp
             film.seek(i)
             shown.append(np.array(film.convert("RGB"), int))
             durations.append(film.info["duration"])
-    assert shown[0].shape == (300, 800, 3)
+    assert shown[0].shape == (150, 400, 3)
     assert len(shown) == 2 * pictures and durations[0] == milliseconds
     assert durations[pictures - 1] == 11 * milliseconds        # equal pictures become one
     for i in range(len(shown)):                                # the same run twice
-        assert np.abs(shown[i][:, :400] - shown[i][:, 400:]).max() == 0
+        assert np.abs(shown[i][:, :200] - shown[i][:, 200:]).max() == 0
     assert np.abs(shown[pictures - 1] - shown[0]).max() > 50
     assert np.abs(shown[pictures] - shown[0]).max() > 50       # another start
 
@@ -1946,31 +1751,15 @@ def test_exercises_of_readme_start_where_it_says():
 
 # ---------------------------------------------------------------- results/
 
-@pytest.fixture
-def results_script(monkeypatch, tmp_path):
-    """Runs a script of results/ in this process, in a folder of its own."""
-    monkeypatch.syspath_prepend(os.path.join(HERE, "results"))
-    monkeypatch.chdir(tmp_path)
-
-    def run_script(name, *words):
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, words)])
-        module = __import__(name)
-        module.main()
-        return module
-
-    yield run_script
-    torch.set_grad_enabled(True)                               # inside.py turns them off
-
-
-def test_inside_looks_into_a_run(evaluated, results_script, capsys):
-    inside = results_script("inside", evaluated[0], "--distractors", "0,3", "--episodes", "2")
-    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert [row[0] for row in rows[1:]] == ["N", "0", "3"]
-    cubes = torch.zeros(2, 2, 18)                              # the target lies at (0, 0)
-    cubes[:, 1, tri.POSITION] = torch.tensor([[0.05, 0.03, 0], [0.05, 0.08, 0]]) / 0.2
-    goal = torch.zeros(2, 12)
-    goal[:, tri.POSITION] = torch.tensor([0.1, 0, 0]) / 0.2
-    assert inside.is_blocked({"cubes": cubes, "goal": goal}).tolist() == [True, False]
+@pytest.mark.parametrize("script, options", [
+    ("inside", ["--distractors", "0,3", "--episodes", "2"]), ("figures", [])])
+def test_scripts_look_at_any_run(evaluated, script, options, tmp_path):
+    pytest.importorskip("matplotlib")
+    path = os.path.join(HERE, "results", f"{script}.py")
+    done = run(path, evaluated[0], *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    if script == "inside":
+        assert [line.split()[0] for line in done.stdout.splitlines()[1:]] == ["N", "0", "3"]
 
 
 def test_tables_of_readme_and_report_are_those_of_the_runs(monkeypatch):
@@ -1987,60 +1776,19 @@ def test_tables_of_readme_and_report_are_those_of_the_runs(monkeypatch):
             assert line in lines, name
 
 
-def test_figures_draws_the_curves_of_any_run(evaluated, results_script, tmp_path):
-    pytest.importorskip("matplotlib").use("Agg")
-    results_script("figures", evaluated[0])
-    assert (tmp_path / "runs.png").stat().st_size > 10_000
-
-
 # ---------------------------------------------------------------- modules
 
 ALONE = ("lrn.py", "rn.py", "attn.py", "ppo.py", "trifinger_env.py")
 
 
-def test_nothing_is_unpickled():
-    for path in glob.glob(os.path.join(HERE, "**", "*.py"), recursive=True):
-        with open(path) as file:
-            nodes = list(ast.walk(ast.parse(file.read())))
-        calls = [ast.unparse(node) for node in nodes if isinstance(node, ast.Call)]
-        assert all("weights_only=True" in call for call in calls
-                   if call.startswith(("torch.load(", "pickle.load"))), path
-
-
-def alone(folder, name):
-    """Run a module as a script, lrn's in short, where nothing else of ours can be imported."""
-    os.chdir(folder)
-    sys.path = [path for path in sys.path if os.path.abspath(path) != HERE]
-    for ours in glob.glob("*.py", root_dir=HERE):
-        sys.modules.pop(ours[:-3], None)
-    runpy.run_path(name)
-    sys.stdout.flush()
-    assert os.fstat(1).st_size == 0                            # importing prints nothing
-    short = name == "lrn.py"
-    module = runpy.run_path(name, run_name="short" if short else "__main__")
-    print(module["demo"](True, updates=2) if short else "ran to its end")
-
-
 @pytest.mark.parametrize("name", ALONE)
 def test_a_module_runs_alone(name, tmp_path):
-    """The example of ppo.py learns: a step costs its distance from the goal, 1 at first."""
+    """lrn's in short. The example of ppo.py learns: at first a step costs 1, a mean distance."""
     shutil.copy(os.path.join(HERE, name), tmp_path)
-    status, printed, errors = Fork(alone, tmp_path, name).end()
-    assert status == 0 and printed, errors
+    in_short = ["-c", "import lrn; print(lrn.demo(True, updates=2))"]
+    done = run(*in_short if name == "lrn.py" else [name], cwd=tmp_path)
+    assert done.returncode == 0 and done.stdout, done.stderr
     if name == "ppo.py":
         returns = [float(line.split("return ")[1].split(",")[0])
-                   for line in printed.splitlines()[:-1]]
+                   for line in done.stdout.splitlines()]
         assert len(returns) == 6 and returns[0] < -4 and min(returns[2:]) > -2.2
-
-
-# ---------------------------------------------------------------- planted defects
-
-def test_every_planted_defect_has_its_place_and_its_test():
-    """results/defects.py quotes code that occurs once, and names tests that exist."""
-    sys.path.insert(0, os.path.join(HERE, "results"))
-    from defects import DEFECTS
-    sources = {name: open(os.path.join(HERE, name)).read() for name, *_ in DEFECTS}
-    for name, source, broken, test in DEFECTS:
-        assert sources[name].count(source) == 1, (name, source)
-        assert source != broken and test in globals(), test
-    assert len(DEFECTS) >= 100

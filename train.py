@@ -13,9 +13,7 @@ A run folder holds progress.csv, one row per update, and checkpoint.pt, saved af
 """
 import argparse
 import contextlib
-import csv
 import fcntl
-import io
 import math
 import os
 import sys
@@ -99,7 +97,8 @@ DEFAULTS = {name: setting.default for name, setting in SETTINGS.items()}
 # A row of progress.csv. Means over the episodes that ended in the update's rollout, with sampled
 # actions (episodes and cut_short: counts): success is fractional_success at the last step,
 # success_strict the same by true volumes, solved the share with success >= 0.8, cut_short how many
-# ended before their time. From std on the learner's: means over the update's minibatches.
+# ended before their time. std: of the actions, after the update. explained_variance: of the returns
+# by the values, before it. lr: its learning rate. The others: means over its minibatches.
 PROGRESS = ("update", "frames", "episodes", "return", "length", "success", "success_strict",
             "solved", "cut_short", "std", "approx_kl", "clip_fraction", "explained_variance",
             "policy_loss", "value_loss", "auxiliary_loss", "entropy", "grad_norm", "lr")
@@ -295,40 +294,36 @@ def load(source):
     return checkpoint, agent.eval()      # for an encoder of your own, with dropout, say
 
 
-def replace(path, content):
-    """Write bytes so that a crash leaves the old file or the new one, never half of it."""
-    with open(path + ".tmp", "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(path + ".tmp", path)
-
-
 def open_progress(path, update):
     """Make progress.csv, or cut it to the rows that the checkpoint knows."""
-    lines = [",".join(PROGRESS) + "\n"]
-    if update:
-        with open(path) as file:
-            lines = file.readlines()[:1 + update]
-    replace(path, "".join(lines).encode())
+    with open(path, "rb+" if update else "wb") as file:
+        if update:
+            file.truncate(sum(map(len, file.readlines()[:1 + update])))
+        else:
+            file.write((",".join(PROGRESS) + "\n").encode())
 
 
 def add_row(path, row):
     """Append a row (dict) to progress.csv."""
     cells = [row[key] if isinstance(row[key], int) else f"{row[key]:.6g}" for key in PROGRESS]
-    with open(path, "a", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerow(cells)
-        file.flush()
+    with open(path, "a") as file:
+        print(*cells, sep=",", file=file, flush=True)
         os.fsync(file.fileno())
 
 
 def save(checkpoint, folder):
-    """Replace the checkpoint of a run, and remove the scores of the weights before."""
+    """Replace the checkpoint of a run, and remove the scores of the weights before.
+
+    A crash leaves the old file or the new one, never half of it.
+    """
     with contextlib.suppress(FileNotFoundError):
         os.remove(os.path.join(folder, "zeroshot.csv"))
-    buffer = io.BytesIO()
-    torch.save(checkpoint, buffer)
-    replace(os.path.join(folder, "checkpoint.pt"), buffer.getvalue())
+    path = os.path.join(folder, "checkpoint.pt")
+    with open(path + ".tmp", "wb") as file:
+        torch.save(checkpoint, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(path + ".tmp", path)
 
 
 # ---- training
@@ -336,9 +331,8 @@ def save(checkpoint, folder):
 def make_learner(args, settings):
     """PPO with its agent and this rank's environments; every rank starts from the same weights."""
     envs, rest = divmod(settings["envs"], args.ranks)
-    if rest or envs * settings["steps"] % settings["minibatches"]:
-        raise ValueError(f"{args.ranks} processes cannot share envs={settings['envs']}, or their "
-                         f"batches do not divide into minibatches={settings['minibatches']}")
+    if rest:
+        raise ValueError(f"{args.ranks} processes cannot share envs={settings['envs']}")
     if settings["steps"] < settings["episode_steps"]:
         raise ValueError(f"rollouts of steps={settings['steps']} never see the end of an episode "
                          f"of episode_steps={settings['episode_steps']}")
@@ -420,10 +414,10 @@ def train(folder, state, learner, rank):
 STOPPED = 130                            # exit status after a Ctrl-C, as shells have it
 
 
-def fail(message, status=2):
-    """End with one line and a status: 2 for bad input, as argparse does."""
+def fail(message):
+    """End with one line and status 2, as argparse does for bad input."""
     print(f"{os.path.basename(sys.argv[0])}: error: {message}", file=sys.stderr)
-    sys.exit(status)
+    sys.exit(2)
 
 
 def read_command(argv=None):

@@ -185,13 +185,14 @@ def squares_overlap(a, b):
     return ~apart
 
 
-def corners_inside(squares):
-    """(n,) bool: do the corners of cubes at x, y, yaw (columns of `squares`) keep off the wall?"""
+def are_free(squares, placed):
+    """(n,) bool: which squares touch neither the wall nor one that is placed already?"""
     quarter = math.pi / 4 + math.pi / 2 * np.arange(4)         # corners: CUBE / sqrt(2) from x, y
     angle = squares[:, 2:3] + quarter                          # (n, 4)
     x = squares[:, :1] + CUBE / math.sqrt(2) * np.cos(angle)
     y = squares[:, 1:2] + CUBE / math.sqrt(2) * np.sin(angle)
-    return (np.hypot(x, y) < WALL - GAP).all(1)
+    is_inside = (np.hypot(x, y) < WALL - GAP).all(1)
+    return is_inside & ~squares_overlap(squares, placed).any(1)
 
 
 # ---- the environment
@@ -423,7 +424,7 @@ class TriFingerEnv(Env):
         fixed = 5                                              # fingers, goal, target: never nudged
         for _ in range(100_000):                               # a few, except in a crowd
             new = self._draw_squares(radius, yaw)
-            free = self._are_free(new, placed)
+            free = are_free(new, placed)
             if free.any():
                 placed.append(new[free.argmax()])
                 return
@@ -431,7 +432,7 @@ class TriFingerEnv(Env):
                 moved = placed.pop(int(self._np_random.integers(fixed, len(placed))))
                 steps = self._np_random.normal(size=(64, 4)) * [0.01, 0.01, 0.2, 0.0]   # m, m, rad
                 new = np.concatenate([moved + steps, [moved]])             # at worst: back again
-                placed.append(new[self._are_free(new, placed).argmax()])
+                placed.append(new[are_free(new, placed).argmax()])
         raise ValueError(f"the arena cannot hold {self.distractors + 1} cubes: no free place found")
 
     def _draw_squares(self, radius, yaw, count=64):
@@ -442,11 +443,6 @@ class TriFingerEnv(Env):
         half = (CUBE + GAP) / 2
         return np.stack([r * np.cos(angle), r * np.sin(angle), (2 * u[:, 2] - 1) * yaw,
                          np.full(count, half)], axis=1)
-
-    @staticmethod
-    def _are_free(new, placed):
-        """(n,) bool: which squares touch neither the wall nor one that is placed already?"""
-        return corners_inside(new) & ~squares_overlap(new, placed).any(1)
 
     def reset(self, *, seed=None, options=None):
         """Start an episode. Returns (observation, info with fractional_success).
@@ -469,7 +465,9 @@ class TriFingerEnv(Env):
         height = CUBE / 2
         if self.task == "lift":
             height = float(self._np_random.uniform(CUBE / 2, HIGHEST_GOAL))
-        self._set_goal(goal, height)
+        self.goal = (goal[0], goal[1], height), yaw_quaternion(goal[2])
+        identifier = self._ids[self.target]
+        self._goal_row = (1.0, CUBE, CUBE, CUBE, *self.goal[0], *self.goal[1], identifier)
         target_pose, *poses = cubes
         poses.insert(self.target, target_pose)
         for cube, (x, y, yaw) in zip(self._cubes, poses):
@@ -486,13 +484,6 @@ class TriFingerEnv(Env):
         self._read()
         self._moment = self._measure()
         return self._observe(), {"fractional_success": self._moment.rho}
-
-    def _set_goal(self, pose, height):
-        x, y, yaw = pose
-        self.goal = (x, y, height), yaw_quaternion(yaw)
-        position, quaternion = self.goal
-        identifier = self._ids[self.target]
-        self._goal_row = (1.0, CUBE, CUBE, CUBE, *position, *quaternion, identifier)
 
     # ---- a step
 

@@ -5,11 +5,10 @@
     python results/inside.py --figures                   the numbers of figures 6, 7, 8, relations
 
 The table: success; the same where the way from target to goal was clear and where a distractor
-blocked it; share of blocked ones; distance from the target cube to where the read-out sees it;
-drift of z from z at the N of training; for LRN the length of the distractors' mean relation against
-the target's; for lifting success by the goal's height. All but success are of the start. A crowd
-is made of scenes at the N of training, as Agent.crowd makes it: it judges the transfer without a
-look at a test N.
+blocked it; share of blocked ones; distance from the target cube to where the read-out sees it; for
+LRN the length of the distractors' mean relation against the target's; for lifting success by the
+goal's height. All but success are of the start. A crowd is made of scenes at the N of training, as
+Agent.crowd makes it: it judges the transfer without a look at a test N.
 --figures plays results/runs/push-{lrn,rn,attn}-n2-seed0 and writes figure6.csv (z at each N in the
 plane), figure6-drift.csv (distance of the z at N from those at 2; also of the runs without crowds),
 figure7.csv (LRN's relations in the plane) and figure8.csv (their lengths) in results/;
@@ -51,7 +50,9 @@ def starts(checkpoint, N, episodes):
     """The first observations of the episodes, as one batch."""
     env = make_env(checkpoint["task"], N, checkpoint["settings"])
     seeds = [evaluate.episode_seed(episode) for episode in range(episodes)]
-    return batch_of([env.reset(seed=seed)[0] for seed in seeds])
+    observations = [env.reset(seed=seed)[0] for seed in seeds]
+    env.close()
+    return batch_of(observations)
 
 
 def record(group, N, episodes, measure):
@@ -67,6 +68,7 @@ def record(group, N, episodes, measure):
             obs, *_ = env.step(action)
             played.append(obs)
         measured.append(measure(agent, batch_of(played)))
+    env.close()
     return torch.stack(measured, dim=1).numpy()
 
 
@@ -90,13 +92,6 @@ def read_error(agent, obs):
     return 1000 * POSITION_SCALE * away.mean()
 
 
-def drift_of(z, z_trained):
-    """Mean distance of z (B, Z) from z_trained, in units of that between two rows of z_trained."""
-    B = len(z)
-    spread = torch.cdist(z_trained, z_trained).sum() / (B * (B - 1))
-    return (z - z_trained).norm(dim=1).mean() / spread
-
-
 def relations_of(agent, obs):
     """LRN's relations, fingers first, then the target, then distractors: (B, K, D)."""
     return agent.encoder.relations(*agent.tokens(obs)).roll(3, dims=1)     # fingers were last
@@ -115,7 +110,6 @@ def by_number(checkpoint, agent, N, episodes):
     ends = evaluate.play(checkpoint, agent, N, range(episodes))
     success = torch.tensor([end["fractional_success"] for end in ends])
     obs = starts(checkpoint, N, episodes)
-    trained = starts(checkpoint, checkpoint["distractors"], episodes)
     blocked = is_blocked(obs)
     row = {
         "N": N,
@@ -124,7 +118,6 @@ def by_number(checkpoint, agent, N, episodes):
         "way blocked": success[blocked].mean(),
         "share blocked": blocked.float().mean(),
         "read error, mm": read_error(agent, obs),
-        "drift of z": drift_of(agent.encode(obs), agent.encode(trained)),
     }
     if checkpoint["encoder"] == "lrn":
         row["relations"] = distractors_share(agent, obs)

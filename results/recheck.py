@@ -3,7 +3,7 @@
     python results/recheck.py                   five runs at random, at N = 2 and 9: ten minutes
     python results/recheck.py RUN [RUN ...]     runs of your choice
 
-A line a run and N: the score in zeroshot.csv (episodes 0 to 199), that of as many other episodes,
+One line per run and N: the score in zeroshot.csv (episodes 0 to 199), that of as many other episodes,
 and whether they differ by more than the 95 % interval of their difference: one in twenty should.
 """
 import csv

@@ -33,7 +33,9 @@ all_runs() {
     group "0"         0-9,14,19 "--set crowd=0"        lift-{rn,attn}-n2-nocrowd
     group "0 1"       0-9       ""                     push-lrn-n{0,1,3}           # figures 1, 4
     group "0"         0-9       ""                     push-{rn,attn}-n{0,1,3}
-    group "0"         0-9       "--set frames=9000000" push-mlp-n{0,1,2}
+    for n in 0 1 2; do                                         # an MLP cannot change N
+        group "0"     $n        "--set frames=9000000" push-mlp-n$n
+    done
     for variant in objects tokens mean max; do                 # figure 5; the last --encoder counts
         group "0 1"   0-9       "--encoder lrn-$variant"     push-lrn-n2-$variant
     done
