@@ -6,10 +6,10 @@
     python evaluate.py RUN RUN --gif push.gif --distractors 9          a film, side by side
 
 Episode j starts from the same seed at every N and for every agent: goal, target cube and the first
-distractors stand in the same places (unless a crowd has to be nudged, as in nearly all episodes at
-N = 14, or an agent was trained with another goal_yaw); identifiers, the target's row and a lifting
-goal's height differ. The paper does not say whether its scores are of sampled actions or of the
-policy's means; CausalWorld's evaluation plays the means, and so do we.
+distractors stand in the same places (unless a crowd has to be nudged, as in some episodes at N = 9
+and nearly all at 14, or an agent was trained with another goal_yaw); identifiers, the target's row
+and a lifting goal's height differ. The paper does not say whether its scores are of sampled actions
+or of the policy's means; CausalWorld's evaluation plays the means, and so do we.
 
 The table's columns are means over episodes: success, the share of the goal's axis-aligned box that
 the cube's box covers at the last step, as in CausalWorld; strict, the same by the cubes' true
@@ -32,8 +32,8 @@ import torch
 from train import STOPPED, derived_seed, fail, load, make_env
 from trifinger_env import DIVERGED, SOLVED, TIME
 
-CHUNK = 25                               # episodes side by side; another number may change bits
-EVALUATION = 20220131                    # as a run's seed: keeps episodes apart from training's
+CHUNK = 25                               # episodes side by side; the last bits depend on it
+EVALUATION = 20220131                    # in place of a run's seed: other episodes than training's
 PICTURE_PERIOD = 0.08                    # s between two pictures of a film, about
 PICTURE = 400, 300                       # width and height of one
 
@@ -89,7 +89,7 @@ def play_chunk(checkpoint, agent, distractors, episodes):
 # ---- the sweep over N
 
 def work(content, distractors, episodes):
-    """play() in a process of its own. `content`: a checkpoint's bytes; its file may change."""
+    """play() in a process of its own. `content`: a checkpoint, as bytes: its file may change."""
     torch.set_num_threads(1)
     return play(*load(io.BytesIO(content)), distractors, episodes)
 

@@ -6,7 +6,7 @@ One relation r_i = g_theta(o_i, o_goal) is computed per object, always with the 
 linear in K. The sum does not depend on the order of the objects, and any K will do.
 
 Shapes: objects (B, K, D), goal (B, D) -> z (B, Z).
-        B batch, K objects, D token width (the paper's d), Z width of z (its d_z); o_goal: its o_g.
+        B batch, K objects, D token width (the paper's d), Z width of z (its d_z).
 Run:    python lrn.py        trains at K = 3, tests at K = 1 to 10, without a robot: 20 seconds
 """
 import math
@@ -89,9 +89,9 @@ class LRNMax(LRN):
 # ---- the paper's question without a robot
 
 def scene(B, K, crowd=None):
-    """Objects (B, K, 3): x, y, name. Goal (B, 3): 0, 0, the first one's name. Its place (B, 2).
+    """Objects (B, K, 3): x, y, name. Goal (B, 3): 0, 0, object 0's name. Object 0's place (B, 2).
 
-    crowd=M: the first, and M drawn from the other K - 1 with replacement.
+    crowd=M: object 0 and M copies of others, drawn with replacement: (B, M+1, 3).
     """
     places = 2 * torch.rand(B, K, 2) - 1
     if crowd is not None:
@@ -104,34 +104,34 @@ def scene(B, K, crowd=None):
     return objects, goal, places[:, 0]
 
 
-def learn(error, modules, updates):
-    """Adam on error(), that of a fresh batch each time, with a linearly falling learning rate."""
+def learn(loss, modules, updates):
+    """Minimise loss(), which draws a fresh batch; Adam, with a linearly falling learning rate."""
     optimizer = torch.optim.Adam(nn.ModuleList(modules).parameters(), lr=2e-3)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, updates)
     for _ in range(updates):
         optimizer.zero_grad()
-        error().backward()
+        loss().backward()
         optimizer.step()
         schedule.step()
 
 
 def demo(with_crowds, variant=LRN, updates=1000):
-    """Learn at K = 3 where the named object is. {K: RMS error}; always guessing 0 would have 1."""
+    """Learn at K = 3 where the named object is. {K: RMS error}; 1 is a blind guess."""
     torch.manual_seed(0)
     token, encoder, read = nn.Linear(3, 64), variant(), nn.Linear(25, 2)
 
-    def error(objects, goal, where):
+    def loss(objects, goal, where):
         z = encoder(token(objects), token(goal))
         return (read(z) - where).square().mean() / (1 / 3)     # 1/3: variance of a coordinate
 
-    def batch_error():
+    def batch_loss():
         # M is uniform here; train.py draws it in two steps, so that RN learns to read soon.
         crowd = int(torch.randint(9, ())) if with_crowds and torch.rand(()) < 0.5 else None
-        return error(*scene(128, 3, crowd))
+        return loss(*scene(128, 3, crowd))
 
-    learn(batch_error, [token, encoder, read], updates)
+    learn(batch_loss, [token, encoder, read], updates)
     with torch.no_grad():
-        return {K: error(*scene(2000, K)).sqrt().item() for K in (1, 3, 5, 10)}
+        return {K: loss(*scene(2000, K)).sqrt().item() for K in (1, 3, 5, 10)}
 
 
 if __name__ == "__main__":

@@ -49,17 +49,17 @@ RUN = {
 }
 ENV = {
     "episode_steps": Setting(125, 2500, "5 s, not 30 s (4.1): more episodes show more goals"),
-    "substeps": Setting(5, 3, "25 Hz, not 83.3 (4.1, CW): held longer, noisy actions move more"),
+    "substeps": Setting(5, 3, "25 Hz, not 83.3 (4.1, CW): noise that is held longer explores more"),
     "timestep": Setting(0.008, 0.004, "s, of a physics step; CW: 0.004; 8 ms are sound (tested)"),
-    "action_mode": Setting("integrated", "absolute", "targets that last keep a grip; CW: absolute"),
+    "action_mode": Setting("integrated", "absolute", "CW: absolute; ours: no action, no move"),
     "action_scale": Setting(0.1, 0.1, "rad, largest step of a joint target; absolute: not used"),
-    "motor": Setting("position", "torque", "CW's torque law; at 8 ms resting joints shake"),
+    "motor": Setting("position", "torque", "CW's torque law; it shakes in steps of 8 ms"),
     "cube_mass": Setting(0.08, 0.02, "kg; CW's pushing and picking tasks: 0.02"),
     "finger_friction": Setting(1.0, 0.5, "IsaacGymEnvs; CW asks for 0.1, PyBullet keeps 0.5"),
     "goal_yaw": Setting(0.0, math.pi / 4, "largest yaw, rad; 0: only the place counts (4.1: pose)"),
 }
-# A.1: alpha_1; alpha_2, at which 2 mm earn 0.5 (at ours 10); alpha_3, which makes slow cubes costly
-# (ours: none). Only ours is reach: fingertips to the cube, as in CW's script.
+# alpha_1, alpha_2, alpha_3 of A.1. With 250 a way of 2 mm earns 0.5, with our 5000 it earns 10. The
+# curiosity term is a cost that falls with speed; ours: none. "reach", tips to the cube, is from CW.
 PAPER_REWARD = {"overlap": 100.0, "distance": 250.0, "curiosity": 10.0}
 REWARD = {f"reward_{term}": Setting(weight, PAPER_REWARD.get(term, 0.0), "weight of the term")
           for term, weight in REWARD_WEIGHTS.items()}
@@ -86,7 +86,7 @@ NETWORK = {
     "token_dim": Setting(64, 128, "D; not printed; 64 takes half the time of our guess"),
     "z_dim": Setting(25, 25, "Z (section 5)"),
     "hidden": Setting(128, 128, "width of token MLPs and heads; a guess; CW: 256"),
-    "log_std": Setting(-0.7, 0.0, "log std of actions at the start; rlpyt: 0; -1 learns later"),
+    "log_std": Setting(-0.7, 0.0, "log std of actions at the start; rlpyt: 0; with -1 slower"),
 }
 SETTINGS = {**RUN, **ENV, **REWARD, **LEARNER, **NETWORK}
 # LiftingCube takes longer, most of its score comes while the learning rate is small, and noise
@@ -164,7 +164,7 @@ class Agent(nn.Module):
         super().__init__()
         D, Z, hidden = settings["token_dim"], settings["z_dim"], settings["hidden"]
         self.is_mlp, self.largest_crowd = encoder == "mlp", settings["crowd"]
-        self.crowds = torch.Generator()                        # the same on all ranks: reseed()
+        self.crowds = torch.Generator()                        # reseed() seeds all ranks' alike
         if self.is_mlp:
             self.encoder = ConcatMLP(distractors, Z, hidden)
         else:
@@ -192,15 +192,15 @@ class Agent(nn.Module):
         return self.policy(z), self.log_std, self.value(z).squeeze(-1)
 
     def auxiliary(self, obs):
-        """Read-out loss (ours): how well z encodes what the task is about, in scaled units.
+        """Read-out loss (ours): how badly z encodes what the task is about, in scaled units.
 
         A small head reads FACTS numbers from z: the target cube's position and velocity, the goal's
         position and the three fingertips; the loss is their mean squared error. A batch holds few
         episodes, so few answers to "which cube is meant?". Hence the question is asked anew: every
-        sample gets fresh identifiers, a random cube as target and a goal from the shuffled batch.
+        sample gets fresh identifiers, any of its cubes as target and a goal from another sample.
         Half of the minibatches show a crowd() in place of the scene's cubes.
         """
-        obs = {name: values[::4] for name, values in obs.items()}          # a quarter is enough
+        obs = {name: values[::4] for name, values in obs.items()}          # a quarter will do
         cubes = obs["cubes"]
         B, count = cubes.shape[:2]
         rows, target = torch.arange(B), torch.randint(count, (B,))
@@ -219,9 +219,10 @@ class Agent(nn.Module):
         return (self.read_out(z) - facts).square().mean()
 
     def crowd(self, cubes, target):
-        """The target among M of the scene's other cubes, drawn with replacement.
+        """The target among M copies of the scene's other cubes, drawn with replacement.
 
         cubes (B, N+1, 18), target (B,) -> crowd (B, M+1, 18), the target's index in it (B,).
+        Copies of one cube differ in the identifier alone, which auxiliary() gives them.
         At a fixed N a constant, such as the bias of f_phi, can cancel whatever N distractors add to
         the sum. At a random M it cannot, so a distractor has to add nothing. M is uniform up to a
         number that is itself uniform: mostly small, so that RN learns to read soon, at times large.
