@@ -37,7 +37,7 @@ TASKS = {                                # rows of figure 3 -> group of runs
     "PushingCube, without crowds": "push-{}-n2-nocrowd",
     "LiftingCube, with crowds": "lift-{}-n2",
     "LiftingCube, without crowds": "lift-{}-n2-nocrowd",
-    "PushingCube, the paper's world": "push-{}-n2-paperworld",
+    "PushingCube, the paper's world, with crowds": "push-{}-n2-paperworld",
 }
 ABLATIONS = {                            # panels of figure 5 -> {group of runs: label}
     "Parts of LRN": {

@@ -46,7 +46,8 @@ all_runs() {
         group "0 1"   0-9       "--set reward_$term=0"       push-lrn-n2-no$term
     done
     group "0" 0-9 "--set frames=6000000 $paper_world"        push-{lrn,rn,attn}-n2-paperworld
-    group "0" 0-9 "--paper --set frames=20000000"            push-lrn-n2-paper
+    group "0" 0-9 "--paper"                                  push-lrn-n2-paper     # a day each
+    group "0" 0-9 "--paper --set auxiliary=30 crowd=8"       push-lrn-n2-paperreadout
 }
 
 state_of() {
