@@ -33,12 +33,11 @@ OTHERS = ("#E69F00", "#AA4499", "black", "#56B4E9", "#8B5A2B",     # where an en
 KINDS = {"finger 0": "black", "finger 1": "saddlebrown", "finger 2": "red", "target": "green",
          "distractors": "blue"}          # of relations -> colours of the paper's figure 7
 TASKS = {                                # rows of figure 3 -> group of runs
-    "PushingCube, with crowds": "push-{}-n2",
-    "PushingCube, without crowds": "push-{}-n2-nocrowd",
-    "LiftingCube, with crowds": "lift-{}-n2",
-    "LiftingCube, without crowds": "lift-{}-n2-nocrowd",
-    "PushingCube, the paper's world, with crowds": "push-{}-n2-paperworld",
+    "PushingCube": "push-{}-n2",
+    "LiftingCube": "lift-{}-n2",
+    "Pushing, paper's world": "push-{}-n2-paperworld",
 }
+CROWDS = {"": "with crowds", "-nocrowd": "without crowds"}                 # end of a group's name
 ABLATIONS = {                            # panels of figure 5 -> {group of runs: label}
     "Parts of LRN": {
         "push-lrn-n2": "LRN",
@@ -197,16 +196,22 @@ def draw_frames_to(axes, encoder, score):
 
 
 def figure_3():
-    """Figure 3: training at N = 2 and zero-shot scores, with and without crowds."""
-    figure, panels = plt.subplots(len(TASKS), 2, figsize=(9, 14), layout="constrained")
-    for (title, name), (left, right) in zip(TASKS.items(), panels):
+    """Figure 3: training at N = 2 with crowds; zero-shot scores with and without."""
+    tasks = [task for task, name in TASKS.items() if runs_of(name.format("lrn"))]
+    figure, panels = plt.subplots(len(tasks), 3, figsize=(11, 3.5 * len(tasks)), squeeze=False,
+                                  layout="constrained")
+    for task, (left, *others) in zip(tasks, panels):
         for encoder in PAPER:
-            runs = runs_of(name.format(encoder))
+            runs = runs_of(TASKS[task].format(encoder))
             if runs:
                 draw_training(left, runs, *ENCODERS[encoder])
-                draw_zero_shot(right, runs, *ENCODERS[encoder])
-        left.set(title=title, ylabel="success in training", ylim=(0, 1))
-        right.set(title=title, ylabel="zero-shot success")
+        left.set(title=f"{task}: training", ylabel="success", ylim=(0, 1))
+        for (end, title), axes in zip(CROWDS.items(), others):
+            for encoder in PAPER:
+                runs = runs_of(TASKS[task].format(encoder) + end)
+                if runs:
+                    draw_zero_shot(axes, runs, *ENCODERS[encoder])
+            axes.set(title=f"zero-shot, {title}")
     one_legend(figure, 3)
     return figure
 
@@ -296,12 +301,12 @@ def figure_8():
 def figure_readout():
     """Not in the paper: how soon z encodes where the named cube is, with and without crowds."""
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained", sharey=True)
-    for (title, name), axes in zip(TASKS.items(), panels):     # the first two: PushingCube
+    for (end, title), axes in zip(CROWDS.items(), panels):
         for encoder in PAPER:
-            runs = runs_of(name.format(encoder))
+            runs = runs_of(f"push-{encoder}-n2{end}")
             if runs:
                 draw_training(axes, runs, *ENCODERS[encoder], column="auxiliary_loss")
-        axes.set(title=title, yscale="log")
+        axes.set(title=f"PushingCube, {title}", yscale="log")
     panels[0].set(ylabel="read-out loss")
     one_legend(figure, 3)
     return figure
