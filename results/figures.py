@@ -76,9 +76,7 @@ def read(run, name):
     try:
         with open(path, newline="") as file:
             rows = list(csv.DictReader(file))
-        columns = {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
-        columns["success"]               # it had another name before
-        return columns
+        return {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
     except (OSError, LookupError, TypeError, ValueError):
         raise ValueError(f"{path} is missing, empty or not a CSV of this version") from None
 
