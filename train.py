@@ -58,9 +58,9 @@ ENV = {
     "finger_friction": Setting(1.0, 0.5, "IsaacGymEnvs; CW asks for 0.1, PyBullet keeps 0.5"),
     "goal_yaw": Setting(0.0, math.pi / 4, "largest yaw, rad; 0: only the place counts (4.1: pose)"),
 }
-# alpha_1, alpha_2, alpha_3 of A.1: they teach pushing, but lifting too slowly. With 250 a way of 2 mm
-# earns 0.5, with our 5000 it earns 10. Curiosity is a cost that falls with speed. "reach", tips to
-# the cube, is from CW.
+# alpha_1, alpha_2, alpha_3 of A.1: they teach pushing, but lifting too slowly. 250 pays 0.5 for a
+# way of 2 mm, our 5000 pays 10. Curiosity is a cost that falls with speed. "reach", tips to the
+# cube, is from CW.
 PAPER_REWARD = {"overlap": 100.0, "distance": 250.0, "curiosity": 10.0}
 REWARD = {f"reward_{term}": Setting(weight, PAPER_REWARD.get(term, 0.0), "weight of the term")
           for term, weight in REWARD_WEIGHTS.items()}
