@@ -89,9 +89,9 @@ def play_chunk(checkpoint, agent, distractors, episodes):
 # ---- the sweep over N
 
 def work(content, distractors, episodes):
-    """play() in a process of its own. `content`: a checkpoint, as bytes: its file may change."""
+    """play_chunk() in another process. `content`: a checkpoint, as bytes: its file may change."""
     torch.set_num_threads(1)
-    return play(*load(io.BytesIO(content)), distractors, episodes)
+    return play_chunk(*load(io.BytesIO(content)), distractors, episodes)
 
 
 def sweep(content, numbers, episodes):
@@ -105,8 +105,7 @@ def sweep(content, numbers, episodes):
     print("   N  success           strict            solved", flush=True)
     rows, begin = [], time.monotonic()
     ctrl_c = signal.signal(signal.SIGINT, signal.SIG_IGN)      # for this process, not the workers
-    played = {n: [pool.submit(work, content, n, part) for part in parts]
-              for n in numbers}
+    played = {n: [pool.submit(work, content, n, part) for part in parts] for n in numbers}
     signal.signal(signal.SIGINT, ctrl_c)
     try:
         for n, chunks in played.items():

@@ -1646,7 +1646,7 @@ def test_the_table_and_its_csv_are_what_play_says(evaluated):
 
 @pytest.mark.parametrize("words", [[], ["--save"]])
 def test_scores_are_not_saved_unasked_nor_if_the_run_trained_on_meanwhile(
-        evaluated, tmp_path, monkeypatch, words):
+        evaluated, tmp_path, monkeypatch, capsys, words):
     folder = shutil.copytree(evaluated[0], tmp_path / "run")
     scores = folder / "zeroshot.csv"
     before = scores.read_bytes()
@@ -1661,6 +1661,7 @@ def test_scores_are_not_saved_unasked_nor_if_the_run_trained_on_meanwhile(
     with pytest.raises(SystemExit) if words else contextlib.nullcontext():
         evaluate.main()
     assert scores.read_bytes() == before
+    assert ("trained on meanwhile" in capsys.readouterr().err) == bool(words)
 
 
 def children_of(parent, word):
@@ -1706,7 +1707,7 @@ def test_film_shows_episodes_side_by_side(substeps, pictures, milliseconds, simp
                                           monkeypatch):
     """15 steps at 25 Hz: start, every other step, the end; at 6.25 Hz every step. Then a rest."""
     Image = pytest.importorskip("PIL.Image")
-    monkeypatch.setattr(evaluate, "PICTURE", (200, 150))        # soon drawn
+    monkeypatch.setattr(evaluate, "PICTURE", (200, 150))       # soon drawn
     simple["settings"]["substeps"] = substeps
     evaluate.film(["simple", "simple"], 2, 2, str(tmp_path / "a.gif"))
     with Image.open(tmp_path / "a.gif") as film:
@@ -1761,6 +1762,18 @@ def test_scripts_look_at_any_run(evaluated, script, options, tmp_path):
     assert done.returncode == 0, done.stderr
     if script == "inside":
         assert [line.split()[0] for line in done.stdout.splitlines()[1:]] == ["N", "0", "3"]
+    else:
+        assert (tmp_path / "runs.png").stat().st_size > 10_000
+
+
+def test_a_distractor_blocks_the_way_within_a_cubes_width(monkeypatch):
+    """The target lies at (0, 0), its goal 10 cm along x."""
+    monkeypatch.syspath_prepend(os.path.join(HERE, "results"))
+    import inside
+    cubes, goal = torch.zeros(2, 2, 18), torch.zeros(2, 12)
+    cubes[:, 1, tri.POSITION] = torch.tensor([[0.05, 0.03, 0], [0.05, 0.08, 0]]) / 0.2
+    goal[:, tri.POSITION] = torch.tensor([0.1, 0, 0]) / 0.2
+    assert inside.is_blocked({"cubes": cubes, "goal": goal}).tolist() == [True, False]
 
 
 def test_tables_of_readme_and_report_are_those_of_the_runs(monkeypatch):

@@ -96,7 +96,7 @@ DEFECTS = [
     ("trifinger_env.py", "own + other * widening", "own + other",
      "test_nothing_overlaps_at_the_start"),
     ("trifinger_env.py", "is_inside & ~squares_overlap(squares, placed).any(1)",
-     "~squares_overlap(new, placed).any(1)", "test_nothing_overlaps_at_the_start"),
+     "~squares_overlap(squares, placed).any(1)", "test_nothing_overlaps_at_the_start"),
     ("trifinger_env.py", "np.sqrt(u[:, 0])", "u[:, 0]",
      "test_goals_are_uniform_where_a_finger_can_get_behind_them"),
     ("trifinger_env.py", "(placed, WALL, math.pi / 4)", "(placed, GRASP_RADIUS, math.pi / 4)",

@@ -91,6 +91,14 @@ def numbers(rows, name):
     return [float(row[name]) for row in rows]
 
 
+def of_encoders(name):
+    """Runs, label and colour of each of the paper's encoders that has runs of this name."""
+    for encoder in PAPER:
+        runs = runs_of(name.format(encoder))
+        if runs:
+            yield runs, *ENCODERS[encoder]
+
+
 # ---- curves: pairs of x and y
 
 def training_curve(run, column):
@@ -199,16 +207,12 @@ def figure_3():
     figure, panels = plt.subplots(len(tasks), 3, figsize=(11, 3.5 * len(tasks)), squeeze=False,
                                   layout="constrained")
     for task, (left, *others) in zip(tasks, panels):
-        for encoder in PAPER:
-            runs = runs_of(TASKS[task].format(encoder))
-            if runs:
-                draw_training(left, runs, *ENCODERS[encoder])
+        for runs, label, color in of_encoders(TASKS[task]):
+            draw_training(left, runs, label, color)
         left.set(title=f"{task}: training", ylabel="success", ylim=(0, 1))
         for (end, title), axes in zip(CROWDS.items(), others):
-            for encoder in PAPER:
-                runs = runs_of(TASKS[task].format(encoder) + end)
-                if runs:
-                    draw_zero_shot(axes, runs, *ENCODERS[encoder])
+            for runs, label, color in of_encoders(TASKS[task] + end):
+                draw_zero_shot(axes, runs, label, color)
             axes.set(title=f"zero-shot, {title}")
     one_legend(figure, 3)
     return figure
@@ -300,10 +304,8 @@ def figure_readout():
     """Not in the paper: how soon z encodes where the named cube is, with and without crowds."""
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained", sharey=True)
     for (end, title), axes in zip(CROWDS.items(), panels):
-        for encoder in PAPER:
-            runs = runs_of(f"push-{encoder}-n2{end}")
-            if runs:
-                draw_training(axes, runs, *ENCODERS[encoder], column="auxiliary_loss")
+        for runs, label, color in of_encoders("push-{}-n2" + end):
+            draw_training(axes, runs, label, color, column="auxiliary_loss")
         axes.set(title=f"PushingCube, {title}", yscale="log")
     panels[0].set(ylabel="read-out loss")
     one_legend(figure, 3)
