@@ -1783,6 +1783,7 @@ def test_tables_of_readme_and_report_are_those_of_the_runs(monkeypatch):
     found = tables.groups()
     assert found
     for name, table in (("README.md", tables.readme_table),
+                        ("results/README.md", tables.claims_table),
                         ("results/README.md", tables.report_table)):
         with open(os.path.join(HERE, name)) as file:
             lines = file.read().splitlines()

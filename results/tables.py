@@ -4,7 +4,7 @@
 
 A cell is the mean success over a group's seeds ± half the range between the worst and the best of
 them; a group is the runs whose names differ in the seed alone. A test holds that both texts have
-the lines of README's table and of the table of runs. Needs matplotlib, as figures.py does, which
+the lines of these tables. Needs matplotlib, as figures.py does, which
 reads the runs.
 """
 import glob
@@ -15,24 +15,24 @@ from figures import ABLATIONS, PAPER, RUNS, frames_to, group_of, read, training_
 ROWS = {"**LRN**": "{}-lrn-n2", "RN": "{}-rn-n2", "ATTN": "{}-attn-n2",       # of README's table
         "LRN without crowds": "{}-lrn-n2-nocrowd"}
 FEW, MANY = (0, 2, 5, 9), (0, 1, 2, 3, 5, 9, 14, 19)           # N in README; in the report
-# Rows of the table of claims: the claim, the groups that it is measured in, and the N of the score,
-# or None for the million frames until success in training is 0.5.
+# Rows of the table of claims: the claim, the groups that it is measured in, the N of the score, or
+# None for the million frames until success in training is 0.5, and our verdict.
 CLAIMS = (
-    ("LRN and RN learn pushing almost perfectly (figure 3): at 2", "push-{}-n2", 2),
-    ("and lifting: at 2", "lift-{}-n2", 2),
-    ("ATTN learns later (3): million frames to 0.5", "push-{}-n2", None),
-    ("LRN and RN keep their score, ATTN does not (3): pushing at 9", "push-{}-n2", 9),
-    ("the same without crowds", "push-{}-n2-nocrowd", 9),
-    ("lifting at 9", "lift-{}-n2", 9),
-    ("the same without crowds", "lift-{}-n2-nocrowd", 9),
-    ("LRN and RN work with fewer objects (3): pushing at 0", "push-{}-n2", 0),
-    ("ATTN needs \"exactly two distractors\" (4.3): pushing at 1", "push-{}-n2", 1),
-    ("the same without crowds", "push-{}-n2-nocrowd", 1),
-    ("the transfer may hold beyond 9 (4.3): pushing at 19", "push-{}-n2", 19),
-    ("LRN alone transfers from training at 1 (4): at 9", "push-{}-n1", 9),
-    ("LRN and RN transfer from training at 3 (4): at 9", "push-{}-n3", 9),
-    ("in the paper's world, with its reward: at 2", "push-{}-n2-paperworld", 2),
-    ("at 9", "push-{}-n2-paperworld", 9),
+    ("LRN and RN learn pushing \"almost perfectly\" (figure 3): at 2", "push-{}-n2", 2, "yes"),
+    ("and lifting (3): at 2", "lift-{}-n2", 2, "yes"),
+    ("ATTN learns later (3): million frames to 0.5", "push-{}-n2", None, "slightly"),
+    ("LRN and RN keep their score, ATTN does not (3): pushing, at 9", "push-{}-n2", 9, "nearly"),
+    ("the same without crowds", "push-{}-n2-nocrowd", 9, "no"),
+    ("the same in lifting, with crowds", "lift-{}-n2", 9, "yes"),
+    ("in lifting without crowds", "lift-{}-n2-nocrowd", 9, "no"),
+    ("LRN and RN work with fewer objects (3): pushing, at 0", "push-{}-n2", 0, "yes"),
+    ("ATTN needs \"exactly two distractors\" (4.3): pushing, at 1", "push-{}-n2", 1, "no"),
+    ("the same without crowds", "push-{}-n2-nocrowd", 1, "no"),
+    ("the transfer may hold beyond 9 (4.3): pushing, at 14", "push-{}-n2", 14, "in part"),
+    ("LRN alone transfers from training at 1 (4): pushing, at 9", "push-{}-n1", 9, ""),
+    ("LRN and RN transfer from training at 3 (4): pushing, at 9", "push-{}-n3", 9, ""),
+    ("in the paper's world, with its reward: at 2", "push-{}-n2-paperworld", 2, ""),
+    ("in the paper's world: at 9", "push-{}-n2-paperworld", 9, ""),
 )
 
 
@@ -98,13 +98,13 @@ def measured(found, group, N):
 
 
 def claims_table(found):
-    """Lines of the table of claims, whose verdicts are for a reader to give."""
-    yield line("the paper says", "LRN", "RN", "ATTN")
-    yield "|---" * 4 + "|"
-    for claim, group, N in CLAIMS:
+    """Lines of the report's table of claims; the verdicts are CLAIMS' own."""
+    yield line("the paper says", "LRN", "RN", "ATTN", "verdict")
+    yield "|---" * 5 + "|"
+    for claim, group, N, verdict in CLAIMS:
         cells = [measured(found, group.format(encoder), N) for encoder in PAPER]
         if any(cells):
-            yield line(claim, *cells)
+            yield line(claim, *cells, verdict)
 
 
 def variants_table(found):
