@@ -44,7 +44,7 @@ ABLATIONS = {                            # panels of figure 5 -> {group of runs:
         "push-lrn-n2-objects": "without relations",
         "push-lrn-n2-tokens": "the same, with the goal's token",
         "push-lrn-n2-mean": "mean, no LayerNorm",
-        "push-lrn-n2-max": "maximum, not sum (ours)",
+        "push-lrn-n2-maxnocrowd": "maximum, no crowds (ours)",
         "push-lrn-n2-z10": "z of 10 numbers, not 25",
         "push-lrn-n2-z50": "z of 50",
         "push-lrn-n2-z100": "z of 100",
@@ -125,7 +125,7 @@ def frames_to(run, score):
 
 def draw_seeds(axes, curves, label, color, marker=None):
     """Thin lines for the curves of the seeds, a thick one for their mean where all have a point."""
-    for x, y in curves:
+    for x, y in curves if len(curves) > 1 else []:
         axes.plot(x, y, color=color, linewidth=0.7, alpha=0.5)
     points = [dict(zip(x, y)) for x, y in curves]
     shared = sorted(set.intersection(*map(set, points)))
@@ -286,14 +286,14 @@ def figure_7():
 
 
 def figure_8():
-    """Figure 8: mean length of LRN's relations by kind over an episode, at N = 4 and 5."""
+    """Figure 8: mean length of LRN's relations by kind over an episode at N = 5."""
     rows = read_rows("figure8.csv")
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained", sharey=True)
-    for N, axes in zip((4, 5), panels):
-        of_n = [row for row in rows if row["N"] == str(N)]
+    for (end, title), axes in zip(CROWDS.items(), panels):
+        of_run = [row for row in rows if row["group"] == f"push-lrn-n2{end}"]
         for kind, color in KINDS.items():
-            axes.plot(numbers(of_n, "step"), numbers(of_n, kind), color=color, label=kind)
-        axes.set(title=f"{N} distractors", xlabel="step", ylim=(0, None))
+            axes.plot(numbers(of_run, "seconds"), numbers(of_run, kind), color=color, label=kind)
+        axes.set(title=title, xlabel="seconds")
         axes.margins(x=0)
     panels[0].set(ylabel="mean length of a relation")
     one_legend(figure, 5)
@@ -321,7 +321,7 @@ def figure_relations():
         scores = [success_at(os.path.join(RUNS, row["run"]), 9) for row in rows]
         axes.plot(numbers(rows, "share"), scores, marker, color=ENCODERS["lrn"][1],
                   fillstyle="none" if is_plain else "full", markersize=8, label=label)
-    axes.set(xlabel="a distractor's mean relation / the target's", xlim=(0, None),
+    axes.set(xlabel="length of the distractors' mean relation / the target's", xlim=(0, None),
              ylabel="success at N = 9", ylim=(0, 1))
     axes.legend()
     return figure

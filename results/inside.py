@@ -222,14 +222,14 @@ def figure_7(episodes, numbers=range(3, 7)):
 
 
 def figure_8(episodes):
-    """Lengths of LRN's relations by kind over an episode; of distractors, their mean."""
+    """Lengths of LRN's relations by kind over an episode at N = 5; of distractors, their mean."""
     rows = []
-    for N in (4, 5):
-        r = record("push-lrn-n2", N, episodes, relations_of)   # (steps, E, K, D)
+    for group in ("push-lrn-n2", "push-lrn-n2-nocrowd"):
+        r = record(group, 5, episodes, relations_of)           # (steps, E, K, D)
         lengths = np.linalg.norm(r, axis=-1).mean(axis=1)      # (steps, K)
         for step, row in enumerate(lengths.tolist(), 1):
-            rows.append((N, step, *row[:4], sum(row[4:]) / N))
-    write("figure8.csv", ("N", "step", *KINDS, "distractors"), rows)
+            rows.append((group, step / 25, *row[:4], sum(row[4:]) / 5))     # 25 Hz
+    write("figure8.csv", ("group", "seconds", *KINDS, "distractors"), rows)
 
 
 def figure_relations(episodes):

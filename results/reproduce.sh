@@ -36,9 +36,10 @@ all_runs() {
     for n in 0 1 2; do                                         # an MLP cannot change N
         group "0"     $n        "--set frames=9000000" push-mlp-n$n
     done
-    for variant in objects tokens mean max; do                 # figure 5; the last --encoder counts
+    for variant in objects tokens mean; do                     # figure 5; the last --encoder counts
         group "0 1"   0-9       "--encoder lrn-$variant"     push-lrn-n2-$variant
     done
+    group "0 1"       0-9,14,19 "--encoder lrn-max --set crowd=0" push-lrn-n2-maxnocrowd
     for z in 10 50 100; do
         group "0 1"   0-9       "--set z_dim=$z"             push-lrn-n2-z$z
     done
