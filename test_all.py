@@ -1789,6 +1789,9 @@ def test_tables_of_readme_and_report_are_those_of_the_runs(monkeypatch):
             lines = file.read().splitlines()
         for line in table(found):
             assert line in lines, name
+    with open(os.path.join(HERE, "results", "cures.csv")) as file:
+        for _, *errors in list(csv.reader(file))[1:]:          # the report has other names
+            assert any(line.endswith(tables.line(*errors)) for line in lines), errors
 
 
 # ---------------------------------------------------------------- modules
