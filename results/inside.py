@@ -6,9 +6,10 @@
 
 The table: success; the same where the way from target to goal was clear and where a distractor
 blocked it; share of blocked ones; distance from the target cube to where the read-out sees it; for
-LRN the length of the distractors' mean relation against the target's; for lifting success by the
-goal's height. All but success are of the start. A crowd is made of scenes at the N of training, as
-Agent.crowd makes it: it judges the transfer without a look at a test N.
+LRN the length of the distractors' mean relation against the target's; for lifting success without
+and with a distractor beside the target, and by the goal's height. All but success are of the start.
+A crowd is made of scenes at the N of training, as Agent.crowd makes it: it judges the transfer
+without a look at a test N.
 --figures plays results/runs/push-{lrn,rn,attn}-n2-seed0 and writes figure6.csv (z at each N in the
 plane), figure6-drift.csv (distance of the z at N from those at 2; also of the runs without crowds),
 figure7.csv (LRN's relations in the plane) and figure8.csv (their lengths) in results/;
@@ -85,6 +86,12 @@ def is_blocked(obs):
     return ((to_others - nearest).norm(dim=2) < CUBE).any(1)
 
 
+def has_neighbour(obs):
+    """(B,) bool: is the centre of a distractor within 10 cm of the target's?"""
+    places = obs["cubes"][..., POSITION] * POSITION_SCALE                  # (B, N+1, 3), m
+    return ((places[:, 1:] - places[:, :1]).norm(dim=2) < 0.1).any(1)
+
+
 def read_error(agent, obs):
     """Mean distance in mm from the target cube to where the read-out sees it."""
     seen = agent.read_out(agent.encode(obs))[:, :3]
@@ -122,6 +129,9 @@ def by_number(checkpoint, agent, N, episodes):
     if checkpoint["encoder"] == "lrn":
         row["relations"] = distractors_share(agent, obs)
     if checkpoint["task"] == "lift":
+        near = has_neighbour(obs)
+        row |= {"apart": success[~near].mean(), "beside": success[near].mean(),
+                "share beside": near.float().mean()}
         height = 100 * POSITION_SCALE * obs["goal"][:, POSITION][:, 2]     # cm
         for low, high in BANDS:
             row[f"{low}-{high} cm"] = success[(height >= low) & (height < high)].mean()
