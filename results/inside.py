@@ -1,7 +1,7 @@
 """Look inside trained agents in the episodes that evaluate.py plays.
 
     python results/inside.py RUN --distractors 0,2,9     a table by N
-    python results/inside.py RUN --crowd 10-15           read error among 10 to 15 distractors
+    python results/inside.py RUN --crowd 10-15           a table by crowd: 10 to 15 distractors
     python results/inside.py --figures                   the numbers of figures 6, 7, 8, relations
 
 The table: success; the same where the way from target to goal was clear and where a distractor
@@ -9,7 +9,7 @@ blocked it; share of blocked ones; distance from the target cube to where the re
 LRN the length of the distractors' mean relation against the target's; for lifting success without
 and with a distractor beside the target, and by the goal's height. All but success are of the start.
 A crowd is made of scenes at the N of training, as Agent.crowd makes it: it judges the transfer
-without a look at a test N.
+without a look at a test N. Action shift: by how much (RMS) the crowd changes the mean actions.
 --figures plays results/runs/push-{lrn,rn,attn}-n2-seed0 and writes figure6.csv (z at each N in the
 plane), figure6-drift.csv (distance of the z at N from those at 2; also of the runs without crowds),
 figure7.csv (LRN's relations in the plane) and figure8.csv (their lengths) in results/;
@@ -99,6 +99,11 @@ def read_error(agent, obs):
     return 1000 * POSITION_SCALE * away.mean()
 
 
+def actions_of(agent, obs):
+    """Mean actions (B, 9), clipped as the environment does."""
+    return agent(obs)[0].clamp(-1, 1)
+
+
 def relations_of(agent, obs):
     """LRN's relations, fingers first, then the target, then distractors: (B, K, D)."""
     return agent.encoder.relations(*agent.tokens(obs)).roll(3, dims=1)     # fingers were last
@@ -141,6 +146,7 @@ def by_number(checkpoint, agent, N, episodes):
 def by_crowd(checkpoint, agent, M, episodes):
     """A row of the table by crowd: M of a scene's distractors, drawn with replacement."""
     obs = starts(checkpoint, checkpoint["distractors"], episodes)
+    before = actions_of(agent, obs)
     B, count = obs["cubes"].shape[:2]
     if count == 1 or M >= len(POOL):
         raise ValueError(f"no crowd of {M}: it takes distractors in training, and at most 20")
@@ -150,7 +156,8 @@ def by_crowd(checkpoint, agent, M, episodes):
     identifiers = POOL[torch.rand(B, len(POOL)).argsort(dim=1)[:, :M + 1]]
     obs["cubes"][..., IDENTIFIER] = identifiers
     obs["goal"][:, IDENTIFIER] = identifiers[:, 0]
-    return {"crowd": M, "read error, mm": read_error(agent, obs)}
+    shift = (actions_of(agent, obs) - before).square().mean().sqrt()
+    return {"crowd": M, "read error, mm": read_error(agent, obs), "action shift": shift}
 
 
 def print_table(run, args):
