@@ -1776,6 +1776,20 @@ def test_a_distractor_blocks_the_way_within_a_cubes_width(monkeypatch):
     assert inside.is_blocked({"cubes": cubes, "goal": goal}).tolist() == [True, False]
 
 
+def test_actions_shift_with_the_size_of_a_crowd_alone_if_every_relation_is_alike(monkeypatch):
+    monkeypatch.syspath_prepend(os.path.join(HERE, "results"))
+    import inside
+    agent = agent_of("lrn")
+    with torch.no_grad():
+        agent.encoder.g[-1].weight.zero_()
+        agent.encoder.g[-1].bias.normal_()
+        agent.encoder.f.bias.normal_()   # without it LayerNorm takes out the number of summands
+        agent.policy[-1].weight.mul_(100)                      # or all actions are near zero
+        checkpoint = {"task": "push", "distractors": 2, "settings": train.DEFAULTS}
+        shifts = [inside.by_crowd(checkpoint, agent, M, 3)["action shift"] for M in (0, 2, 9)]
+    assert shifts[0] > 0.01 and shifts[1] < 1e-5 and shifts[2] > 0.01
+
+
 def test_tables_of_readme_and_report_are_those_of_the_runs(monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.syspath_prepend(os.path.join(HERE, "results"))
