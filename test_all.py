@@ -1767,13 +1767,14 @@ def test_scripts_look_at_any_run(evaluated, script, options, tmp_path):
 
 
 def test_a_distractor_blocks_the_way_within_a_cubes_width(monkeypatch):
-    """The target lies at (0, 0), its goal 10 cm along x."""
+    """The target lies at (0, 0), its goal 10 cm along x. A neighbour is nearer than 10 cm."""
     monkeypatch.syspath_prepend(os.path.join(HERE, "results"))
     import inside
     cubes, goal = torch.zeros(2, 2, 18), torch.zeros(2, 12)
     cubes[:, 1, tri.POSITION] = torch.tensor([[0.05, 0.03, 0], [0.05, 0.08, 0]]) / 0.2
     goal[:, tri.POSITION] = torch.tensor([0.1, 0, 0]) / 0.2
     assert inside.is_blocked({"cubes": cubes, "goal": goal}).tolist() == [True, False]
+    assert inside.has_neighbour({"cubes": 1.1 * cubes}).tolist() == [True, False]
 
 
 def test_actions_shift_with_the_size_of_a_crowd_alone_if_every_relation_is_alike(monkeypatch):

@@ -125,8 +125,9 @@ def frames_to(run, score):
 
 def draw_seeds(axes, curves, label, color, marker=None):
     """Thin lines for the curves of the seeds, a thick one for their mean where all have a point."""
-    for x, y in curves if len(curves) > 1 else []:
-        axes.plot(x, y, color=color, linewidth=0.7, alpha=0.5)
+    if len(curves) > 1:                  # one curve is its own mean
+        for x, y in curves:
+            axes.plot(x, y, color=color, linewidth=0.7, alpha=0.5)
     points = [dict(zip(x, y)) for x, y in curves]
     shared = sorted(set.intersection(*map(set, points)))
     means = [np.mean([of_seed[x] for of_seed in points]) for x in shared]

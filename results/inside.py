@@ -33,6 +33,7 @@ from trifinger_env import CUBE, HIGHEST_GOAL, IDENTIFIER, POSITION, POSITION_SCA
 
 BANDS = [(low, low + 5) for low in range(0, round(100 * HIGHEST_GOAL), 5)]   # of heights, cm
 KINDS = ("finger 0", "finger 1", "finger 2", "target")         # of relations, then distractors
+LRN_GROUPS = ("push-lrn-n2", "push-lrn-n2-nocrowd")            # of runs, with crowds and without
 POINTS = 5000                            # most points that t-SNE and distances are given
 
 
@@ -75,12 +76,16 @@ def record(group, N, episodes, measure):
 
 # ---- measures in B scenes, the target as first cube
 
+def from_target(obs, others):
+    """The way along the floor from the target cube to others (B, M, >= 12): (B, M, 2), m."""
+    target = obs["cubes"][:, :1, POSITION]                     # (B, 1, 3)
+    return (others[..., POSITION] - target)[..., :2] * POSITION_SCALE
+
+
 def is_blocked(obs):
     """(B,) bool: does a distractor lie within a cube's width of the line from target to goal?"""
-    places = obs["cubes"][..., POSITION][..., :2] * POSITION_SCALE         # (B, N+1, 2), m
-    goal = obs["goal"][:, POSITION][:, :2] * POSITION_SCALE                # (B, 2)
-    way = (goal - places[:, 0])[:, None]                       # (B, 1, 2)
-    to_others = places[:, 1:] - places[:, :1]                  # (B, N, 2)
+    way = from_target(obs, obs["goal"][:, None])               # (B, 1, 2)
+    to_others = from_target(obs, obs["cubes"][:, 1:])          # (B, N, 2)
     share = (to_others * way).sum(2) / way.square().sum(2)     # (B, N), of the way
     nearest = share.clamp(0, 1)[..., None] * way               # (B, N, 2)
     return ((to_others - nearest).norm(dim=2) < CUBE).any(1)
@@ -88,8 +93,7 @@ def is_blocked(obs):
 
 def has_neighbour(obs):
     """(B,) bool: is the centre of a distractor within 10 cm of the target's?"""
-    places = obs["cubes"][..., POSITION] * POSITION_SCALE                  # (B, N+1, 3), m
-    return ((places[:, 1:] - places[:, :1]).norm(dim=2) < 0.1).any(1)
+    return (from_target(obs, obs["cubes"][:, 1:]).norm(dim=2) < 0.1).any(1)
 
 
 def read_error(agent, obs):
@@ -240,19 +244,19 @@ def figure_7(episodes, numbers=range(3, 7)):
 
 def figure_8(episodes):
     """Lengths of LRN's relations by kind over an episode at N = 5; of distractors, their mean."""
-    rows = []
-    for group in ("push-lrn-n2", "push-lrn-n2-nocrowd"):
-        r = record(group, 5, episodes, relations_of)           # (steps, E, K, D)
+    rows, N = [], 5
+    for group in LRN_GROUPS:
+        r = record(group, N, episodes, relations_of)           # (steps, E, K, D)
         lengths = np.linalg.norm(r, axis=-1).mean(axis=1)      # (steps, K)
         for step, row in enumerate(lengths.tolist(), 1):
-            rows.append((group, step / 25, *row[:4], sum(row[4:]) / 5))     # 25 Hz
+            rows.append((group, step / 25, *row[:4], sum(row[4:]) / N))     # 25 Hz
     write("figure8.csv", ("group", "seconds", *KINDS, "distractors"), rows)
 
 
 def figure_relations(episodes):
     """What a distractor adds to LRN's sum, in every run with and without crowds."""
     rows = []
-    for group in ("push-lrn-n2", "push-lrn-n2-nocrowd"):
+    for group in LRN_GROUPS:
         for run in sorted(glob.glob(os.path.join(HERE, "runs", f"{group}-seed*"))):
             checkpoint, agent = load(run)
             share = distractors_share(agent, starts(checkpoint, 9, episodes)).item()
