@@ -1804,9 +1804,33 @@ def test_tables_of_readme_and_report_are_those_of_the_runs(monkeypatch):
             lines = file.read().splitlines()
         for line in table(found):
             assert line in lines, name
-    with open(os.path.join(HERE, "results", "cures.csv")) as file:
-        for _, *errors in list(csv.reader(file))[1:]:          # the report has other names
-            assert any(line.endswith(tables.line(*errors)) for line in lines), errors
+
+
+def test_other_tables_of_the_report_are_those_of_their_files():
+    """The numbers of each row are those of a row of a file; labels are the report's own."""
+    def lines_of(name):
+        with open(os.path.join(HERE, "results", name)) as file:
+            return file.read().splitlines()
+
+    def numbers(texts):
+        return [float(text) for text in texts if re.fullmatch(r" *[0-9.]+ *", text)]
+
+    inside = "\n".join(lines_of("inside.txt"))
+    crowds = [run.split("\n\n")[0].splitlines()[2:]
+              for run in inside.split(" --crowd ")[1].split("results/runs/")[1:]]
+    earlier = csv.DictReader(lines_of("earlier.csv"))
+    sources = {                          # a table's first cell: what its rows may hold
+        "| K |": [line.split(",")[1:] for line in lines_of("cures.csv")],
+        "| action shift": [[line.split()[2] for line in run] for run in crowds],
+        "| in place of": [[row[key] for key in ("in_training", "at_2", "at_9")] for row in earlier],
+        "| training LRN": [line.split()[-2:] for line in lines_of("speed.txt")],
+    }
+    report = lines_of("README.md")
+    for first, rows in sources.items():
+        [at] = [i for i, line in enumerate(report) if line.startswith(first)]
+        for line in report[at + 2:report.index("", at)]:
+            ours = numbers(line.split("|")[2:])
+            assert any(numbers(row) == pytest.approx(ours, abs=0.006) for row in rows), line
 
 
 # ---------------------------------------------------------------- modules
