@@ -1766,6 +1766,17 @@ def test_scripts_look_at_any_run(evaluated, script, options, tmp_path):
         assert (tmp_path / "runs.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("package, words", [
+    ("matplotlib", ["results/figures.py"]), ("matplotlib", ["results/tables.py"]),
+    ("PIL", ["evaluate.py", "RUN", "--gif", "a.gif", "--distractors", "2"])])
+def test_a_missing_extra_is_named_in_one_line(package, words):
+    script = (f"import runpy, sys; sys.modules['{package}'] = None; sys.argv = {words};"
+              f"sys.path.insert(0, 'results'); runpy.run_path('{words[0]}', run_name='__main__')")
+    done = run("-c", script)
+    lines = [line for line in done.stderr.splitlines() if "build time" not in line]
+    assert done.returncode > 0 and len(lines) == 1 and "pip install" in lines[0], lines
+
+
 def test_a_distractor_blocks_the_way_within_a_cubes_width(monkeypatch):
     """The target lies at (0, 0), its goal 10 cm along x. A neighbour is nearer than 10 cm."""
     monkeypatch.syspath_prepend(os.path.join(HERE, "results"))

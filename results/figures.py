@@ -17,9 +17,13 @@ import os
 import re
 import sys
 
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.colors import to_rgba
+
+try:
+    import matplotlib.pyplot as plt
+    from matplotlib.colors import to_rgba
+except ImportError:
+    sys.exit("this needs matplotlib: pip install matplotlib")
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 RUNS = os.path.join(HERE, "runs")

@@ -210,7 +210,10 @@ def write(name, columns, rows):
 
 def embedded(labels, points):
     """Labels (tuples), each with the place of its point (n, Z) in the plane by t-SNE."""
-    from sklearn.manifold import TSNE
+    try:
+        from sklearn.manifold import TSNE
+    except ImportError:
+        fail("t-SNE needs scikit-learn: pip install scikit-learn")
     places = TSNE(random_state=0).fit_transform(points).tolist()
     return [(*label, x, y) for label, (x, y) in zip(labels, places)]
 
